@@ -165,6 +165,36 @@ template <int C> struct Values {
 };
 template <> struct Values<0> {};
 
+/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one
+/// for all samples, or one per sample where checkpoints need it.
+template <int S, int C, int kSets> struct PixelState {
+  float transmittance[S];
+  Values<C> channels[kSets];
+  int last[S];
+
+  __device__ void start(bool open) {
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
+    clear_channels();
+  }
+  __device__ void clear_channels() {
+#pragma unroll
+    for (int k = 0; k < kSets; ++k) channels[k] = {};
+  }
+  __device__ Values<C> total() const {
+    Values<C> sum = channels[0];
+#pragma unroll
+    for (int k = 1; k < kSets; ++k) sum += channels[k];
+    return sum;
+  }
+  __device__ bool open() const {
+    bool any = false;
+#pragma unroll
+    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
+    return any;
+  }
+};
+
 /// Adds to `sums` what a splat contributes in the S samples of a lane. composite(s) composites the splat into sample s
 /// and returns what blend_sample returns. A branch around a single addition becomes a predicate, which costs nothing.
 template <int S, int C, class Composite>
@@ -196,9 +226,8 @@ template <class F, int C> struct alignas(16) TileSplat {
   Values<C> channels;
 };
 
-/// A staged splat in use: copied to registers, unless it has too many numbers.
-template <class F, int C>
-using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
+/// A staged splat in use: copied to registers.
+template <class F, int C> using TileSplatRef = const TileSplat<F, C>;
 
 /// The channels of splat `id`: three lie in the splat; else C channels of its row from `first` on, and zeros beyond the
 /// last channel.
@@ -232,14 +261,10 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   };
   alignas(Entries) Entry of_warps[kWarps][kMost];
 
-  /// Lists the staged splats in [from, to) that reach this warp's pixels, and returns their number. Bit w of reach[k]
-  /// says that splat k reaches the pixels of warp w; `reach` is read up to the next multiple of 32. All lanes must call
-  /// it.
-  template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
-    return list(reach, from, to, int(threadIdx.x) / 32);
-  }
-  /// The same for the splats whose bit `number` is set.
-  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number) {
+  /// Lists the staged splats in [from, to) that reach this warp's pixels, and returns their number. Bit `number` of
+  /// reach[k] says that splat k reaches these pixels; `reach` is read up to the next multiple of 32. All lanes must
+  /// call it.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number = int(threadIdx.x) / 32) {
     const int warp = threadIdx.x / 32;
     int n = 0;
     for (int k = from; k < to; k += 32) {
@@ -302,11 +327,9 @@ template <class F, int C, int kBatch> struct Stage {
   }
 
   /// The splats in [k, k + 32) that reach a subtile, in the order of take_first. All lanes must call it.
-  __device__ uint32_t reached(int k, int subtile) const {
+  __device__ uint32_t reached(int k, int subtile = int(threadIdx.x) / 32) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }
-  /// The same for this warp's subtile.
-  __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
 };
 
 /// A sample at the end of a chunk, stored for the backward pass.

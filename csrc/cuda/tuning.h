@@ -3,8 +3,6 @@
 // fill a device are given per multiprocessor; multiprocessors() (launch.cuh) asks the device how many it has.
 #pragma once
 
-#include <cstddef>
-
 namespace ar::cuda {
 
 // Devices
@@ -114,17 +112,10 @@ inline constexpr int kBetweenVotes = 16;
 /// Chunks of the front of a tile in small images, and the least in others. A longer front leaves less to the tail,
 /// whose kernels work side by side but do more work.
 inline constexpr int kShortFront = 1, kLongFront = 8;
-/// Largest splat in a stage [bytes] that is copied to registers before use.
-inline constexpr size_t kSplatInRegisters = 112;
 
-/// Resident blocks of blend_front for lanes with `samples` samples and staged splats of so many bytes.
-constexpr int front_blocks(int samples, bool expensive, size_t splat_bytes) {
-  return samples > 1 ? 1 : expensive || splat_bytes > 96 ? 4 : 5;
-}
-/// Resident blocks of tail_through and tail_blend.
-constexpr int tail_through_blocks(int samples, bool expensive, size_t splat_bytes) {
-  return samples > 1 ? 3 : front_blocks(samples, expensive, splat_bytes);
-}
+/// Resident blocks of blend_front for lanes with `samples` samples, and of tail_through and tail_blend.
+constexpr int front_blocks(int samples, bool expensive) { return samples > 1 ? 1 : expensive ? 4 : 5; }
+constexpr int tail_through_blocks(int samples, bool expensive) { return samples > 1 ? 3 : expensive ? 4 : 5; }
 constexpr int tail_blend_blocks(int samples) { return samples > 1 ? 3 : 4; }
 /// Warps of a block of tail_sum, which share the chunks of 32 pixels: a single warp waits for memory most of the time.
 inline constexpr int kTailSumWarps = 4;
@@ -132,10 +123,11 @@ inline constexpr int kTailSumWarps = 4;
 inline constexpr int kTailLoads = 32, kTailLoadsKept = 16;
 
 /// Warps of a block of blend_vjp, each with a chunk of its own: as few as let shared memory hold many blocks.
-constexpr int vjp_warps(int samples) { return samples <= 2 ? 4 : 1; }
+constexpr int vjp_warps(int samples) { return samples == 1 ? 4 : 1; }
 /// Resident blocks of blend_vjp. Where lanes hold pixels in registers, a fifth block would leave each lane too few.
-constexpr int vjp_blocks(int samples, bool holds_pixels, bool holds_samples, size_t splat_bytes) {
-  return samples > 1 ? (holds_samples ? 11 : 1) : holds_pixels ? 4 : splat_bytes <= 48 ? 6 : 5;
+constexpr int vjp_blocks(int samples, bool expensive, int channels) {
+  if (samples > 1) return channels == 3 ? 11 : 1;
+  return channels == 3 ? 4 : expensive ? 5 : 6;
 }
 /// Blocks of blend_vjp per multiprocessor, which take chunks until none is left: as many as any device holds.
 inline constexpr int kVjpBlocksPerSm = 16;
@@ -148,9 +140,7 @@ inline constexpr int kGroupBatch = 128;
 /// as long as a few blocks fit into shared memory.
 constexpr int group_vjp_batch(bool small_group) { return small_group ? 64 : 32; }
 /// Resident blocks of both.
-constexpr int group_blocks(int samples, bool small_group) {
-  return samples > 4 ? 1 : samples > 1 ? 2 : small_group ? 5 : 4;
-}
+constexpr int group_blocks(int samples, bool small_group) { return samples > 1 ? 2 : small_group ? 5 : 4; }
 
 // moment/: samples that move
 

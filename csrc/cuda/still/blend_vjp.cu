@@ -4,6 +4,19 @@
 #include "cuda/still/vjp.cuh"
 
 namespace ar::cuda {
+namespace {
+
+template <class F, int C, bool kMeans> void launch_kernel(const BlendVjpParams& p, cudaStream_t stream) {
+  constexpr int kWarps = vjp_warps(F::kSamples);
+  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksPerSm * multiprocessors());
+  launch(blend_vjp_kernel<F, C, kMeans>, {blocks, 32 * kWarps, sizeof(VjpShared<F, C>)}, stream, p);
+}
+template <class F, int C> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
+  if (p.mean_sums == MeanSums::kNone) return launch_kernel<F, C, false>(p, stream);
+  launch_kernel<F, C, true>(p, stream);
+}
+
+}  // namespace
 
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream) {
   visit_pixels(footprint, [&](auto f) {
@@ -11,8 +24,8 @@ void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream
     if constexpr (family_of<F>(kFewChannels) == Family::kStill) {
       with_lanes<F>(p.grid, [&](auto of_lane) {
         using OfLane = decltype(of_lane);
-        if (!p.channels.data) return launch_blend_vjp_few<OfLane, 3>(p, stream);
-        launch_blend_vjp_few<OfLane, kFewChannels>(p, stream);
+        if (!p.channels.data) return launch_blend_vjp<OfLane, 3>(p, stream);
+        launch_blend_vjp<OfLane, kFewChannels>(p, stream);
       });
     }
   });

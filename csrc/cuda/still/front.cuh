@@ -19,19 +19,15 @@
 #include "cuda/launch.cuh"
 #include "cuda/still/output.cuh"
 #include "cuda/still/stage.cuh"
-#include "cuda/still/tail.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-template <class F, int C>
-inline constexpr int kFrontBlocks =
-    blocks_per_sm(front_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, C>)), kBlendThreads);
-
 /// A block per tile. `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kKeep`: stores what
 /// the backward pass needs.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(front_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+    blend_front_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = kChunkLength, kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
@@ -67,7 +63,9 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
     params.tile_open[tile] = more;
     if (more) params.open_tiles[atomicAdd(&counts.open_tiles, 1)] = tile;
   }
-  if (kKeep) store_last<F>(params, pixel, state.last);
+#pragma unroll
+  for (int s = 0; s < S; ++s)
+    if (kKeep && pixel.inside) params.last[sample_index<F>(pixel, s)] = state.last[s];
   if (!more) {
     total += state.total();
     store_pixel<F>(params, pixel, total, state.transmittance);
@@ -85,24 +83,6 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 #pragma unroll
     for (int s = 0; s < S; ++s) checkpoints.transmittance(front_length - 1, s) = state.transmittance[s];
     checkpoints.set_total(front_length - 1, total);
-  }
-}
-
-template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
-  constexpr int S = F::kSamples;
-  const unsigned blocks = kBlocksPerSm * multiprocessors();  // of the tail, which share its work
-  const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
-  launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
-  launch(tail_through_kernel<F>, of_chunks, stream, p);
-  launch(tail_scan_kernel, of_parts, stream, p, S);
-  launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
-  launch(tail_sum_kernel<LaneSamples<S, F::kLanes>, C, kKeep>, of_sums, stream, p);
-}
-template <class F, int C> void launch_blend_few(const BlendParams& p, cudaStream_t stream) {
-  if (p.transmittance) {
-    launch_blend<F, C, true>(p, stream);
-  } else {
-    launch_blend<F, C, false>(p, stream);
   }
 }
 

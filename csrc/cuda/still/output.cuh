@@ -106,11 +106,6 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> to
   }
   if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
-template <class F> __device__ void store_last(const BlendParams& params, Pixel pixel, const int (&last)[F::kSamples]) {
-  if (!pixel.inside) return;
-#pragma unroll
-  for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
-}
 
 /// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the
 /// channels of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.

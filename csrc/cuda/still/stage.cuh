@@ -9,36 +9,6 @@
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one
-/// for all samples, or one per sample where checkpoints need it.
-template <int S, int C, int kSets> struct PixelState {
-  float transmittance[S];
-  Values<C> channels[kSets];
-  int last[S];
-
-  __device__ void start(bool open) {
-#pragma unroll
-    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
-    clear_channels();
-  }
-  __device__ void clear_channels() {
-#pragma unroll
-    for (int k = 0; k < kSets; ++k) channels[k] = {};
-  }
-  __device__ Values<C> total() const {
-    Values<C> sum = channels[0];
-#pragma unroll
-    for (int k = 1; k < kSets; ++k) sum += channels[k];
-    return sum;
-  }
-  __device__ bool open() const {
-    bool any = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
-    return any;
-  }
-};
-
 /// The splats that a block blends together, and lists of those that reach each warp's pixels.
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   static constexpr int kBatch = kBlendThreads;
@@ -84,15 +54,13 @@ __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec
                               PixelState<F::kSamples, C, kSets>& state) {
   using Stage = BlendStage<F, C>;
   const int reached = stage.list_reached(count);
-  int entries[] = {-1};  // of the last splat of this batch that was composited, with kOffsets
+  int entries[F::kSamples] = {-1};  // of the last splat of this batch that was composited, with kOffsets
+  int (&last)[F::kSamples] = Stage::kOffsets ? entries : state.last;
+  const int first = Stage::kOffsets ? 0 : index + 1;
   for (int from = 0; from < reached; from += kBetweenVotes) {
     if (!__any_sync(kAllLanes, state.open())) break;
     stage.for_each_listed(from, min(reached, from + kBetweenVotes), [&](TileSplatRef<F, C> splat, auto entry) {
-      if constexpr (Stage::kOffsets) {
-        composite<F>(splat, p, int(entry), state, entries);
-      } else {
-        composite<F>(splat, p, index + int(entry) + 1, state, state.last);
-      }
+      composite<F>(splat, p, first + int(entry), state, last);
     });
   }
   if (Stage::kOffsets && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;

@@ -9,17 +9,6 @@
 
 namespace ar::cuda {
 
-/// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
-template <class F, int C>
-__device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
-  const int reached = stage.list_reached(count);
-  stage.for_each_listed(0, reached, [&](TileSplatRef<F, C> splat, auto) {
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s)
-      transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
-  });
-}
-
 /// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks
 /// share them.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
@@ -33,13 +22,11 @@ template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const
   }
 }
 
+/// Writes to the checkpoints what each tail chunk alone lets through, without a threshold at which to stop.
 template <class F>
-inline constexpr int kThroughBlocks =
-    blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, 0>)), kBlendThreads);
-
-/// Writes to the checkpoints what each tail chunk alone lets through.
-template <class F>
-__global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads,
+                                  blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+    tail_through_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   __shared__ BlendStage<F, 0> stage;
@@ -52,7 +39,10 @@ __global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through
       __syncthreads();
       const int count = stage.load(params.splats, params.channels, list, k, end);
       __syncthreads();
-      pass_all<F>(stage, count, p, transmittance);
+      stage.for_each_listed(0, stage.list_reached(count), [&](TileSplatRef<F, 0> splat, auto) {
+#pragma unroll
+        for (int s = 0; s < S; ++s) transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
+      });
     }
     const TransmittancePlanes planes(params, S, tail.tile, int(threadIdx.x));
 #pragma unroll
@@ -153,17 +143,6 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks
 
 inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
 
-/// The tail chunks [first, end) of a warp.
-struct TailShare {
-  int first, end;
-
-  __device__ TailShare(int front, int chunks) {
-    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
-    first = min(front + int(threadIdx.x / 32) * share, chunks);
-    end = min(first + share, chunks);
-  }
-};
-
 /// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum
 /// depends on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
 /// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
@@ -178,8 +157,11 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
-    TailShare share(front_of(params), chunks_of(params, tile));
-    if (warp == 0) share.first = checkpoints.first_chunk;
+    const int front = front_of(params), chunks = chunks_of(params, tile);
+    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
+    int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // the warp has chunks [begin, end)
+    const int end = min(begin + share, chunks);
+    if (warp == 0) begin = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
 #pragma unroll
@@ -187,19 +169,19 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       const bool has_channels = kKeep || s == 0;
       Values<C> sum = {};
       float last = 0;  // at the end of the last of these chunks that the sample reached
-      for (int first = share.first; first < share.end; first += kBatch) {
+      for (int first = begin; first < end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
           ends[k] = 0;
-          if (first + k >= share.end) continue;
+          if (first + k >= end) continue;
           if (has_channels) own[k] = checkpoints.channels(first + k, s);
           ends[k] = checkpoints.transmittance(first + k, s);
         }
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
-          if (has_channels && first + k < share.end) sum += own[k];
+          if (has_channels && first + k < end) sum += own[k];
           if (ends[k] != 0) last = ends[k];
         }
       }
@@ -219,7 +201,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
 #pragma unroll
           for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }
-        accumulate_farther<kBatch>(checkpoints, share.first, share.end, s, farther);
+        accumulate_farther<kBatch>(checkpoints, begin, end, s, farther);
       }
       __syncthreads();  // before the next sums
     }

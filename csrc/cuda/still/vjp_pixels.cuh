@@ -7,49 +7,42 @@
 
 namespace ar::cuda {
 
-/// Whether each lane keeps its eight pixels in registers: with one sample and three channels, unless the splat needs
-/// too many registers. A visit of a subtile then neither waits for shared memory nor spends instructions on it, which
-/// is worth more than the warps that fit on a multiprocessor less.
-template <class F, int C>
-inline constexpr bool kHoldsPixels = F::kSamples == 1 && C == 3 && sizeof(TileSplat<F, C>) <= 112;
+/// Whether each lane keeps the state of all samples of its eight pixels (VjpSample) in registers. Then each subtile has
+/// its own code, and shared memory has room to add up the sums of several pairs together (PairSums).
+template <int C> inline constexpr bool kHoldsSamples = C == 3;
 
-/// Whether each lane keeps the state of all samples of these pixels (VjpSample) in registers. Then each subtile has its
-/// own code, and shared memory has room to add up the sums of several pairs together (PairSums).
-template <class F, int C>
-inline constexpr bool kHoldsSamples =
-    kHoldsPixels<F, C> || (F::kSamples == 4 && C == 3 && sizeof(TileSplat<F, C>) <= 64);
+/// Whether each lane keeps the other numbers of its pixels (VjpPixels) in registers too. A visit of a subtile then
+/// neither waits for shared memory nor spends instructions on it, which is worth more than the warps that fit on a
+/// multiprocessor less.
+template <class F, int C> inline constexpr bool kHoldsPixels = kHoldsSamples<C> && F::kSamples == 1;
 
 /// Whether two subtiles, one below the other, are visited under one branch. Two pixels of a lane then have independent
 /// instructions, and there are half as many branches. Not where weights are expensive: more subtiles are visited in
 /// vain.
 template <class F, int C> inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && !F::kExpensive;
 
-/// Whether each subtile has its own code: where the code is short, or pixels are in registers. Otherwise 11 of 58
+/// Whether each subtile has its own code: where the code is short, or samples are in registers. Otherwise 11 of 58
 /// instructions compute where a subtile's pixels are.
 template <class F, int C>
-inline constexpr bool kUnrollsSubtiles = kHoldsSamples<F, C> || (F::kSamples == 1 && sizeof(TileSplat<F, C>) <= 48);
+inline constexpr bool kUnrollsSubtiles = kHoldsSamples<C> || (F::kSamples == 1 && !F::kExpensive);
 
 /// kCount pixels with S samples and C channels: those of a warp in shared memory, or those of a lane in registers.
 template <int S, int C, int kCount> struct VjpPixels {
-  static constexpr bool kPacked = C == 3;  ///< the fourth number of g is `last` of sample 0, as bits
-  static constexpr int kLasts = kPacked ? S - 1 : S;
-  float4 g[kCount];  ///< gradient with respect to the channels of one sample
-  int last[kLasts > 0 ? kLasts : 1][kLasts > 0 ? kCount : 1];
+  static constexpr int kPacked = C == 3 ? 1 : 0;    ///< with 1 the fourth number of g is `last` of sample 0, as bits
+  float4 g[kCount];                                 ///< gradient with respect to the channels of one sample
+  int last[S > kPacked ? S - kPacked : 1][kCount];  ///< of the other samples
 
   __device__ int last_of(int s, int pixel, const float4& g_pixel) const {
-    if (kPacked) return s == 0 ? __float_as_int(g_pixel.w) : last[s > 0 ? s - 1 : 0][pixel];
-    return last[kPacked ? 0 : s][pixel];
+    return s < kPacked ? __float_as_int(g_pixel.w) : last[s - kPacked][pixel];
   }
   __device__ void set(int pixel, const Values<C>& values) {
-    g[pixel] = {values.v[0], values.v[1], values.v[2], kPacked ? 0 : values.v[C - 1]};
+    g[pixel] = {values.v[0], values.v[1], values.v[2], C == 3 ? 0 : values.v[C - 1]};
   }
   __device__ void set_last(int s, int pixel, int value) {
-    if (!kPacked) {
-      last[kPacked ? 0 : s][pixel] = value;
-    } else if (s == 0) {
+    if (s < kPacked) {
       g[pixel].w = __int_as_float(value);
     } else {
-      last[s > 0 ? s - 1 : 0][pixel] = value;
+      last[s - kPacked][pixel] = value;
     }
   }
 };
@@ -58,24 +51,17 @@ template <int S, int C, int kCount> struct VjpPixels {
 struct VjpSample {
   float transmittance, behind;
 };
-/// Those of kCount pixels.
-template <int S, int kCount> struct VjpSamples {
-  VjpSample of[S][kCount];
-};
 
 /// The part of a warp's pixels that is in shared memory.
 template <class F, int C> struct SharedPixels {
   VjpPixels<F::kSamples, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
-  VjpSamples<F::kSamples, kHoldsSamples<F, C> ? 1 : kTilePixels> samples;
+  VjpSample samples[F::kSamples][kHoldsSamples<C> ? 1 : kTilePixels];
 };
 
 /// A lane's pixels, one of each subtile, and their samples: in registers or in shared memory.
 template <class F, int C> class LanePixels {
  public:
-  static constexpr bool kHolds = kHoldsPixels<F, C>, kHoldsState = kHoldsSamples<F, C>;
-  using Shared = SharedPixels<F, C>;
-
-  __device__ explicit LanePixels(Shared& shared) : shared_(shared) {}
+  __device__ explicit LanePixels(SharedPixels<F, C>& shared) : shared_(shared) {}
 
   /// The gradient with respect to the channels of a sample of subtile b's pixel. last_of() needs it, because its fourth
   /// number may be the `last` of a sample.
@@ -85,30 +71,23 @@ template <class F, int C> class LanePixels {
   __device__ __forceinline__ int last_of(int s, int b, const float4& g) { return pixels().last_of(s, index(b), g); }
   __device__ __forceinline__ void set_last(int s, int b, int last) { pixels().set_last(s, index(b), last); }
   __device__ __forceinline__ VjpSample& sample(int s, int b) {
-    return samples().of[s][kHoldsState ? b : b * 32 + lane_];
+    return kHoldsSamples<C> ? samples_[s][b] : shared_.samples[s][b * 32 + lane_];
   }
 
  private:
-  __device__ __forceinline__ int index(int b) const { return kHolds ? b : b * 32 + lane_; }
+  __device__ __forceinline__ int index(int b) const { return kHoldsPixels<F, C> ? b : b * 32 + lane_; }
   __device__ __forceinline__ auto& pixels() {
-    if constexpr (kHolds) {
+    if constexpr (kHoldsPixels<F, C>) {
       return pixels_;
     } else {
       return shared_.pixels;
     }
   }
-  __device__ __forceinline__ auto& samples() {
-    if constexpr (kHoldsState) {
-      return samples_;
-    } else {
-      return shared_.samples;
-    }
-  }
 
   const int lane_ = lane_id();
-  Shared& shared_;
-  std::conditional_t<kHolds, VjpPixels<F::kSamples, C, kSubtiles>, int> pixels_;
-  std::conditional_t<kHoldsState, VjpSamples<F::kSamples, kSubtiles>, int> samples_;
+  SharedPixels<F, C>& shared_;
+  VjpPixels<F::kSamples, C, kSubtiles> pixels_;  ///< if kHoldsPixels
+  VjpSample samples_[F::kSamples][kSubtiles];    ///< if kHoldsSamples
 };
 
 /// Calls visit(b, p) for the subtiles b of a set, p being what position_of(b) gives for this lane; `of_first`: what it

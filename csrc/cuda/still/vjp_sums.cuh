@@ -63,17 +63,13 @@ template <class F, int C> struct alignas(16) ListedSplat {
   uint32_t reach_and_index;  ///< bits 0 to 7: the subtiles; from bit 27 on: its index in the batch
   int32_t row;               ///< of its sums
 };
-/// In use: copied to registers, unless it has too many numbers.
-template <class F, int C>
-using ListedSplatRef =
-    std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const ListedSplat<F, C>, const ListedSplat<F, C>&>;
 
 /// What a warp keeps in shared memory of a batch: its splats, back to front, and their sums.
 template <class F, int C> struct VjpBatch {
   struct Nothing {};
   alignas(16) int subtile_last[kSubtiles];  ///< pairs up to the last that was composited into a pixel of each subtile
   ListedSplat<F, C> splats[32];
-  std::conditional_t<kHoldsSamples<F, C>, PairSums, Nothing> pair_sums;
+  std::conditional_t<kHoldsSamples<C>, PairSums, Nothing> pair_sums;
 };
 
 }  // namespace ar::cuda

@@ -7,9 +7,6 @@
 
 namespace ar::cuda {
 
-/// What the kernel sums for each pair: gradients, or gradients and MeanSums.
-enum class Sums { kGrads, kBoth };
-
 /// A warp's chunk: the pairs [begin, end) of a tile's list.
 struct VjpChunk {
   TileList list;
@@ -103,14 +100,12 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   }
 }
 
-/// Takes the pixels of a tile back to front through the pairs of a chunk, and sums over them what each pair gives.
-template <class F, int C, Sums kSums> class ChunkWalk {
+/// Takes the pixels of a tile back to front through the pairs of a chunk, and sums over them what each pair gives:
+/// gradients and, with kMeans, MeanSums.
+template <class F, int C, bool kMeans> class ChunkWalk {
  public:
-  using Batch = VjpBatch<F, C>;
-  using Pixels = LanePixels<F, C>;
-
-  __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, Pixels& pixels,
-                                       Batch& batch)
+  __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, LanePixels<F, C>& pixels,
+                                       VjpBatch<F, C>& batch)
       : params_(params), chunk_(chunk), list_(chunk.list), pixels_(pixels), batch_(batch) {}
 
   /// Goes through the whole chunk, in batches of 32 pairs: lists the pairs that reach a pixel, then takes the pixels
@@ -155,10 +150,8 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 
  private:
   static constexpr int S = F::kSamples, kSumCount = 6 + C;
-  static constexpr bool kMeans = kSums == Sums::kBoth;
   /// Whether the sums of several pairs are added up together, by PairSums.
-  static constexpr bool kPairSums = kHoldsSamples<F, C>;
-  using SplatInUse = ListedSplatRef<F, C>;
+  static constexpr bool kPairSums = kHoldsSamples<C>;
 
   /// Takes the pixels through the listed splats, the first of which is the last of the tile's list. The batch begins
   /// with pair k0; `mean_map`: of the lane's own pair, for MeanSums.
@@ -180,7 +173,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   /// values, or its number in the list.
   template <MeanSums kKind, class To>
   __device__ void walk(const ListedSplat<F, C>& listed, int k0, const Mat2<float>& mean_map, To&& to) {
-    SplatInUse splat = listed;
+    const ListedSplat<F, C> splat = listed;
     // By a ballot, so that the compiler knows that all lanes branch alike.
     const uint32_t reached = __ballot_sync(kAllLanes, splat.reach_and_index & subtile_bit_);
     const int j = int(splat.reach_and_index >> 27), at = k0 + j;
@@ -207,8 +200,9 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   /// and `means` of MeanSums. `at`: the splat's index in the tile's list, by reference because the
   /// compiler else turns comparisons with it around.
   template <MeanSums kKind>
-  __device__ void add_pixel(const SplatInUse& splat, const int& at, const Mat2<float>& mean_map, int b, Vec2<float> p,
-                            ShapeGrad<float>& shape, float& weighted, Values<C>& channels, Vec2<float>& means) {
+  __device__ void add_pixel(const ListedSplat<F, C>& splat, const int& at, const Mat2<float>& mean_map, int b,
+                            Vec2<float> p, ShapeGrad<float>& shape, float& weighted, Values<C>& channels,
+                            Vec2<float>& means) {
     const float4 g = pixels_.gradient(b);
     const Values<4> of_pixel_g = {{g.x, g.y, g.z, g.w}};
     float g_color = madd(g.x, splat.channels.v[0], madd(g.y, splat.channels.v[1], g.z * splat.channels.v[2]));
@@ -286,8 +280,8 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   const BlendVjpParams& params_;
   const VjpChunk& chunk_;
   const TileList& list_;
-  Pixels& pixels_;
-  Batch& batch_;
+  LanePixels<F, C>& pixels_;
+  VjpBatch<F, C>& batch_;
   const int lane_ = lane_id();
   const Vec2<float> p0_ = position_of<F>(0, lane_);                   ///< of the lane's sample in subtile 0
   const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;  ///< of subtile number `lane`
