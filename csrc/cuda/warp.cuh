@@ -20,11 +20,15 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
+/// The sum over this lane and lane_id() ^ offset: of x in the lower lane, of y in the upper one.
+__device__ inline float sum_of_pair(const float& x, const float& y, bool upper, int offset) {
+  const float keep = upper ? y : x, give = upper ? x : y;
+  return keep + __shfl_xor_sync(kAllLanes, give, offset);
+}
+
 /// Lanes below 16 get the sum of x, the others of y: 5 shuffles instead of 10, and the bits of warp_sum.
 __device__ inline float warp_sum_of_two(float x, float y) {
-  const bool upper = lane_id() & 16;
-  const float keep = upper ? y : x, give = upper ? x : y;
-  float sum = keep + __shfl_xor_sync(kAllLanes, give, 16);
+  float sum = sum_of_pair(x, y, lane_id() & 16, 16);
 #pragma unroll
   for (int offset = 8; offset > 0; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
   return sum;
@@ -227,20 +231,14 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   for (int half = 4, offset = 16; half > 0; half /= 2, offset /= 2) {
     const bool upper = lane & offset;
 #pragma unroll
-    for (int i = 0; i < half; ++i) {
-      const float keep = upper ? a[i + half] : a[i], give = upper ? a[i] : a[i + half];
-      a[i] = keep + __shfl_xor_sync(kAllLanes, give, offset);
-    }
+    for (int i = 0; i < half; ++i) a[i] = sum_of_pair(a[i], a[i + half], upper, offset);
     if (N == 10 && half == 4) {
-      const float keep = upper ? v[N - 1] : last, give = upper ? last : v[N - 1];
-      last = keep + __shfl_xor_sync(kAllLanes, give, offset);
+      last = sum_of_pair(last, v[N - 1], upper, offset);
     } else if (N > 8) {
       last += __shfl_xor_sync(kAllLanes, last, offset);
     }
   }
-  const bool upper = lane & 2;
-  const float keep = N > 8 && upper ? last : a[0], give = N > 8 && !upper ? last : a[0];
-  const float sum = keep + __shfl_xor_sync(kAllLanes, give, 2);
+  const float sum = sum_of_pair(a[0], N > 8 ? last : a[0], lane & 2, 2);
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 

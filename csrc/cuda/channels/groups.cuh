@@ -130,10 +130,7 @@ template <int C> struct ChannelShare {
       }
       count /= 2;
 #pragma unroll
-      for (int k = 0; k < count; ++k) {
-        const float keep = upper ? sums[k + count] : sums[k], give = upper ? sums[k] : sums[k + count];
-        sums[k] = keep + __shfl_xor_sync(kAllLanes, give, offset);
-      }
+      for (int k = 0; k < count; ++k) sums[k] = sum_of_pair(sums[k], sums[k + count], upper, offset);
     }
     return sums[0];
   }
