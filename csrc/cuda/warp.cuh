@@ -164,11 +164,16 @@ __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #endif
 }
 
-/// Begins to copy a number to shared memory, for all lanes to read after wait_for_copies().
-__device__ inline void copy_async(float* to, const float* from) {
+/// Begins to copy a number, or a quad past the cache of the multiprocessor, to shared memory: for all lanes to read
+/// after wait_for_copies(). T: float or float4.
+template <class T> __device__ void copy_async(T* to, const T* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
-  asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(from) : "memory");
+  if constexpr (sizeof(T) == 16) {
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(from) : "memory");
+  } else {
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(from) : "memory");
+  }
 #else
   *to = *from;
 #endif
@@ -181,34 +186,6 @@ template <int kWidth> __device__ void copy_rows_async(float* to, const float* fr
     if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
   }
 }
-/// An address in shared memory. The empty statement keeps the compiler from computing it again for every copy.
-class CopyTarget {
- public:
-  __device__ explicit CopyTarget(float4* to) {
-#if __CUDA_ARCH__ >= 800
-    address_ = uint32_t(__cvta_generic_to_shared(to));
-    asm volatile("" : "+r"(address_));
-#else
-    to_ = to;
-#endif
-  }
-  /// Begins to copy a quad, past the cache of the multiprocessor.
-  __device__ void copy(int offset, const float4* from) const {
-#if __CUDA_ARCH__ >= 800
-    constexpr int kBytes = sizeof(float4);
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address_ + kBytes * offset), "l"(from) : "memory");
-#else
-    to_[offset] = *from;
-#endif
-  }
-
- private:
-#if __CUDA_ARCH__ >= 800
-  uint32_t address_;
-#else
-  float4* to_;
-#endif
-};
 __device__ inline void wait_for_copies() {
 #if __CUDA_ARCH__ >= 800
   asm volatile("cp.async.wait_all;" ::: "memory");
