@@ -122,18 +122,9 @@ struct GaussianRows {
   }
 };
 
-/// to: [kCameraGradWidth].
-__device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
-  const float* values = &grad.view_x.x;
-#pragma unroll
-  for (int k = 0; k < kCameraGradWidth; ++k) {
-    const float total = warp_sum(values[k]);
-    if (lane_id() == 0) to[k] = total;
-  }
-}
-
 /// The source of project_vjp.
 struct FromPairs {
+  using Params = ProjectVjpParams;
   /// Whether zero_culled_grads writes zeros.
   static constexpr bool kZeroed = true;
   const ProjectVjpParams& params;
@@ -144,7 +135,7 @@ struct FromPairs {
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
   /// Calls use(function from splat to gradient, ShownGrad, MeanSums), if range.count > 0.
   template <class Cam, class Use>
-  __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, PairRange, const SplatSums& sums,
+  __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, const SplatSums& sums,
                         Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
     const float depth = apply_row(camera.view_z, g.means[i]);
@@ -167,6 +158,7 @@ struct FromPairs {
 
 /// The source of project_rows_vjp.
 struct FromRows {
+  using Params = ProjectRowsVjpParams;
   static constexpr bool kZeroed = false;
   const ProjectRowsVjpParams& params;
 
@@ -174,12 +166,9 @@ struct FromRows {
     const int32_t row = params.rows.rows[i];
     return {row, row >= 0 && has_gradient(params.rows, row) ? 1 : 0};
   }
-  struct Nothing {};
-  __device__ Nothing sum(int64_t, PairRange) const { return {}; }
+  __device__ int64_t sum(int64_t, PairRange range) const { return range.first; }  ///< the row
   template <class Cam, class Use>
-  __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, PairRange range, const Nothing&,
-                        Use&& use) const {
-    const int64_t row = range.first;
+  __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, int64_t row, Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
     if (params.rows.colors) shown.color = params.rows.colors[row];
     if (params.rows.depths) shown.depth = params.rows.depths[row];
@@ -191,16 +180,21 @@ struct FromRows {
 /// Coefficients are made in shared memory, then added.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
+  __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
 };
 
-template <class Cam> inline constexpr int kVjpBlocks = Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks;
-
-/// Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out: GaussianGrads<float> or StagedGrads.
-template <class Cam, class From, class Params, class Out>
-__device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
+/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out:
+/// GaussianGrads<float> or, with FromRows, StagedGrads.
+template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
+__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks,
+                                                                 kProjectThreads))
+    project_vjp_kernel(const typename From::Params params) {
+  wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
+  const From from{params};
+  const Out& out = params.grads;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int lane = lane_id(), warp = threadIdx.x / 32;
   const int64_t first = i - lane;
@@ -225,7 +219,7 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   g.sh_stride = min(g.sh_stride, rows.kCount);  // in shared memory
   CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
-    from.visit(camera, g, i, range, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
+    from.visit(camera, g, i, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
       const auto grad_of_splat = [&](const Cov2d<float>& cov, float opacity) {
         forget_loads();
         return grad_of(cov, opacity);
@@ -239,29 +233,13 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   }
   const int stride = params.gaussians.sh_stride;
   if (out.shs) rows.template store<Out::kAdd>(out.shs + first * stride, stride, n);
-  if constexpr (Cam::kFull) {
-    if (camera_grads) store_warp_sums(camera_grad, camera_grads);
+  if (!Cam::kFull || !camera_grads) return;
+  const float* values = &camera_grad.view_x.x;
+#pragma unroll
+  for (int k = 0; k < kCameraGradWidth; ++k) {
+    const float total = warp_sum(values[k]);
+    if (lane == 0) camera_grads[k] = total;
   }
-}
-
-/// A thread per Gaussian.
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    project_vjp_kernel(const ProjectVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
-}
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromRows{params}, params.grads);
-}
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromRows{params}, StagedGrads{{params.grads}});
 }
 
 /// A warp has several groups.
