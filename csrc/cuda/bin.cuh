@@ -166,9 +166,6 @@ struct MaskedPair {
   __device__ int row() const { return value % kBits / 8; }
   __device__ int column() const { return value % 8; }
 };
-struct MaskedPairs {
-  MaskedPair of[32 * kManyTiles];
-};
 
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
@@ -200,7 +197,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
-  __shared__ MaskedPairs stages[kEmitRows][kWarps];
+  __shared__ MaskedPair stages[kEmitRows][kWarps][32 * kManyTiles];
   const int64_t n = params.counts->splats;
   if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
@@ -240,7 +237,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
     const TileMask mask = few_tiles(touched[row]);
     const int own = mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
-    MaskedPair* next = stages[row][warp].of + up_to[row] - own;
+    MaskedPair* next = stages[row][warp] + up_to[row] - own;
 #pragma unroll
     for (int from = 0; from < MaskedPair::kBits; from += 32) {
       for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
@@ -271,7 +268,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
     }
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
-      const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
+      const MaskedPair pair = k < all ? stages[row][warp][k] : MaskedPair{};
       const int32_t position = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
       const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
       const int32_t slot = position + shuffle(to_slot, pair.lane());
@@ -295,27 +292,24 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   writer.finish();
 }
 
-/// The tiles of a splat's bounding box, and of a pixel around it for rounding.
+/// Rows and columns of tiles, or of patches.
 struct BoxOfTiles {
-  Range rows = {0, -1}, columns = {0, -1};
+  Range rows, columns;
 
-  __device__ BoxOfTiles() {}
-  __device__ BoxOfTiles(const Support<float>& support, TileGrid grid)
-      : rows(of_pixels(support.mean.y, support.half_height + support.reach, grid.height, grid)),
-        columns(of_pixels(support.mean.x, support.half_width + support.reach, grid.width, grid)) {}
   __device__ BoxOfTiles in_patches(int bits) const {
-    BoxOfTiles patches;
-    patches.rows = {rows.first >> bits, rows.last >> bits};
-    patches.columns = {columns.first >> bits, columns.last >> bits};
-    return patches;
+    return {{rows.first >> bits, rows.last >> bits}, {columns.first >> bits, columns.last >> bits}};
   }
   __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
-
- private:
-  __device__ static Range of_pixels(float middle, float half, int size, TileGrid grid) {
-    return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
-  }
 };
+
+/// The tiles of a splat's bounding box, and of a pixel around it for rounding.
+__device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGrid grid) {
+  const auto range = [&](float middle, float half, int size) {
+    return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
+  };
+  return {range(support.mean.y, support.half_height + support.reach, grid.height),
+          range(support.mean.x, support.half_width + support.reach, grid.width)};
+}
 
 /// Pairs of patches, where there is no room for all pairs of tiles. Their slots are the splats, to whose rows all
 /// patches add. Slow, with one block, but rare.
@@ -324,7 +318,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
-  const auto tiles_of_splat = [&](int32_t id) { return BoxOfTiles(support_of(splats[id], params.footprint), grid); };
+  const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
   // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. The whole image always fits.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
@@ -347,7 +341,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   int64_t before = 0;
   for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
     const int32_t id = r < n ? params.order[r] : -1;
-    const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles();
+    const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles{{0, -1}, {0, -1}};
     int64_t all;
     int64_t position = before + sum_before<kWarps>(patches.count(), int64_t(0), all);
     before += all;
