@@ -155,11 +155,13 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
     // Later passes count keys past the end too: they come last.
     if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
-  [[maybe_unused]] Value values[kItems];
-  if constexpr (!kFirst) {
+  Value values[kItems];
 #pragma unroll
-    for (int i = 0; i < kItems; ++i) {
-      if (whole || first + 32 * i < n) values[i] = values_in[first + 32 * i];
+  for (int i = 0; i < kItems; ++i) {
+    if constexpr (kFirst) {
+      values[i] = Value(first + 32 * i);
+    } else if (whole || first + 32 * i < n) {
+      values[i] = values_in[first + 32 * i];
     }
   }
   __syncthreads();
@@ -199,11 +201,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
     if (valid) {
       if ((peers & lanes_after) == 0) next = uint16_t(position + 1);
       shared.sorted.keys[position] = keys[i];
-      if constexpr (kFirst) {
-        shared.sorted.values[position] = Value(first + 32 * i);
-      } else {
-        shared.sorted.values[position] = values[i];
-      }
+      shared.sorted.values[position] = values[i];
     }
     __syncwarp();
   }
