@@ -327,7 +327,7 @@ template <class F, int C, int kBatch> struct Stage {
   }
 
   /// The splats in [k, k + 32) that reach a subtile, in the order of take_first. All lanes must call it.
-  __device__ uint32_t reached(int k, int subtile = int(threadIdx.x) / 32) const {
+  __device__ uint32_t reached(int k, int subtile = threadIdx.x / 32) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }
 };

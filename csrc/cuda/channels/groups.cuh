@@ -183,34 +183,26 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane);
   const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane));
-  float transmittance[S];
   Share sums = {};
-  int last[S];
-#pragma unroll
-  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, last[s] = 0;
-  const auto open = [&] {
-    bool any = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
-    return any;
-  };
-  for (int k = 0; k < list.count && __syncthreads_or(open()); k += kGroupBatch) {
+  PixelState<S, 0, 1> state;
+  state.start(pixel.inside);
+  for (int k = 0; k < list.count && __syncthreads_or(state.open()); k += kGroupBatch) {
     const int count = stage.load(params.splats, params.channels, list, k, list.count);
     if (int(threadIdx.x) < count) staged.ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     staged.load(params.channels, first, count, stage.reach);
     __syncthreads();
     for (int from = 0; from < count; from += 32) {
-      if (!__any_sync(kAllLanes, open())) break;
+      if (!__any_sync(kAllLanes, state.open())) break;
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
         TileSplatRef<F, 0> splat = stage.splats[j];
         float contribution = 0;
 #pragma unroll
         for (int s = 0; s < S; ++s) {
-          const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), transmittance[s]);
+          const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
           contribution += b.contribution;
-          last[s] = b.mask ? k + j + 1 : last[s];
+          state.last[s] = b.mask ? k + j + 1 : state.last[s];
         }
         if (!__any_sync(kAllLanes, contribution > 0)) continue;
         sums.add(contribution, staged.values[j]);
@@ -220,10 +212,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   float through = 0;
 #pragma unroll
   for (int s = 0; s < S; ++s) {
-    through += abs(transmittance[s]);
+    through += abs(state.transmittance[s]);
     if (first == 0 && params.transmittance && pixel.inside) {
-      params.transmittance[sample_index<F>(pixel, s)] = abs(transmittance[s]);
-      params.last[sample_index<F>(pixel, s)] = last[s];
+      params.transmittance[sample_index<F>(pixel, s)] = abs(state.transmittance[s]);
+      params.last[sample_index<F>(pixel, s)] = state.last[s];
     }
   }
   through = sum_of_pixel<F>(through);
