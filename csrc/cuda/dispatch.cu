@@ -26,9 +26,9 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
   if (params.channel_sums) clear(params.channel_sums, width);
 }
 
-Family family(int footprint, int channels) {
+Family family_of(int footprint, int channels) {
   Family found = Family::kStill;
-  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
+  visit_pixels(footprint, [&](auto f) { found = cuda::family_of<decltype(f)>(channels); });
   return found;
 }
 
@@ -37,31 +37,28 @@ Family family(int footprint, int channels) {
 int multiprocessors_of_device() { return int(multiprocessors()); }
 
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
-  switch (family(footprint, p.channels.count)) {
-    case Family::kStill:
-      return blend_still(footprint, p, stream);
-    case Family::kMoment:
-      return blend_moment(footprint, p, stream);
-    case Family::kChannels:
-      return blend_channels(footprint, p, stream);
-  }
+  const Family family = family_of(footprint, p.channels.count);
+  if (family == Family::kStill) blend_still(footprint, p, stream);
+  if (family == Family::kMoment) blend_moment(footprint, p, stream);
+  if (family == Family::kChannels) blend_channels(footprint, p, stream);
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
   launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
-  switch (family(footprint, p.channels.count)) {
-    case Family::kStill:
-      return blend_vjp_still(footprint, p, stream);
-    case Family::kMoment:
-      return blend_vjp_moment(footprint, p, first, stream);
-    case Family::kChannels:
-      return blend_vjp_channels(footprint, p, first, stream);
-  }
+  const Family family = family_of(footprint, p.channels.count);
+  if (family == Family::kStill) blend_vjp_still(footprint, p, stream);
+  if (family == Family::kMoment) blend_vjp_moment(footprint, p, first, stream);
+  if (family == Family::kChannels) blend_vjp_channels(footprint, p, first, stream);
 }
 
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) { launch_inspect<decltype(f)>(p, stream); });
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    with_tile_side<F>(p.grid, [&](auto side) {
+      launch(inspect_kernel<F, side>, {unsigned(p.grid.tiles()), kInspectThreads<side>}, stream, p);
+    });
+  });
 }
 
 }  // namespace ar::cuda

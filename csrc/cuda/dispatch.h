@@ -60,6 +60,14 @@ template <class F> constexpr Family family_of(int64_t channels) {
   if (F::kMoves) return Family::kMoment;
   return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
 }
+/// Calls f(OfLane{}) with what a lane blends of a footprint whose samples stay, if kFamily has kernels for it. Launches
+/// of still/ and channels/ begin with this.
+template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {
+  visit_pixels(footprint, [&](auto pixels) {
+    using F = decltype(pixels);
+    if constexpr (!F::kMoves && (kFamily == Family::kChannels || !F::kGeneric)) with_lanes<F>(grid, f);
+  });
+}
 
 /// How a footprint is blended with so many channels.
 struct Route {

@@ -79,15 +79,19 @@ struct alignas(8) Counts {
   AR_HD bool in_patches(int64_t capacity) const { return pairs > capacity; }
 };
 
-struct ProjectParams : ar::ProjectParams<float> {
-  CullBounds<float> bounds;
-  TileGrid grid;
+/// What project and shape_rows write for bin.
+struct BinInput {
   uint32_t* keys;     ///< [n] in the order of depth
   PairRange* ranges;  ///< [n] the count alone
   SplatTiles* tiles;  ///< [n] of splats with pairs
   // Set to zero, for count_depths.
   Counts* counts;
   uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
+};
+
+struct ProjectParams : ar::ProjectParams<float>, BinInput {
+  CullBounds<float> bounds;
+  TileGrid grid;
 };
 
 struct ProjectRowsParams {
@@ -100,14 +104,7 @@ struct ProjectRowsParams {
   PackedRows<float> packed;   ///< instead of rows and radii
 };
 
-struct ShapeRowsParams : ar::ShapeRowsParams<float> {
-  uint32_t* keys;     ///< [n]
-  PairRange* ranges;  ///< [n] the count alone
-  SplatTiles* tiles;  ///< [n] of splats with pairs
-  // Set to zero, for count_depths.
-  Counts* counts;
-  uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
-};
+struct ShapeRowsParams : ar::ShapeRowsParams<float>, BinInput {};
 
 struct EmitParams {
   const float* splats;

@@ -3,29 +3,21 @@
 // fill a device are given per multiprocessor; multiprocessors() (launch.cuh) asks the device how many it has.
 #pragma once
 
+#include <initializer_list>
+
 namespace ar::cuda {
 
 // Devices
 
 /// Threads that a multiprocessor can hold, by __CUDA_ARCH__; of an unknown device the least.
 constexpr int resident_threads(int architecture) {
-  switch (architecture) {
-    case 800:
-    case 900:
-    case 1000:
-    case 1030:
-      return 2048;
-    case 860:
-    case 870:
-    case 880:
-    case 890:
-    case 1100:
-    case 1200:
-    case 1210:
-      return 1536;
-    default:
-      return 1024;  // 750
+  for (int known : {800, 900, 1000, 1030}) {
+    if (architecture == known) return 2048;
   }
+  for (int known : {860, 870, 880, 890, 1100, 1200, 1210}) {
+    if (architecture == known) return 1536;
+  }
+  return 1024;  // 750
 }
 #if defined(__CUDA_ARCH__)
 inline constexpr int kArchitecture = __CUDA_ARCH__;
@@ -189,10 +181,7 @@ inline constexpr int kMapThreads = 1024;
 inline constexpr int kMostInShared = 8;
 /// Groups of a segment for each warp of its block. With one cell, whose tiles of 8x8 pixels have two groups, a block of
 /// one warp would take too long; in tiles of 4x4 pixels fewer warps were slower.
-inline constexpr int kMostGroupsOfWarp = 2;
-constexpr int groups_of_warp(int samples, bool small_tiles) {
-  return samples == 1 || small_tiles ? 1 : kMostGroupsOfWarp;
-}
+constexpr int groups_of_warp(int samples, bool small_tiles) { return samples == 1 || small_tiles ? 1 : 2; }
 /// Segments whose maps chain_maps reads at once, since each of them waits for memory.
 inline constexpr int kMapsAhead = 8;
 /// Groups of a tile up to which their sums are added up in shared memory; with more groups they would leave room for

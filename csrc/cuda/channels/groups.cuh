@@ -38,13 +38,6 @@ template <int C> struct ChannelShare {
 #pragma unroll
     for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
   }
-  /// Sums over the four lanes that share a pixel, for this lane's own pixel.
-  __device__ static float gather(const float (&parts)[kPixels]) {
-    float sum = parts[0];
-#pragma unroll
-    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
-    return sum;
-  }
   /// This lane's channels of a splat.
   __device__ static void read(const Eighth<C> (&splat)[8], float (&own)[kOwn]) {
     const Eighth<C> first = splat[lane_id() / 4], second = splat[lane_id() / 4 ^ 1];
@@ -99,7 +92,10 @@ template <int C> struct ChannelShare {
 #pragma unroll
       for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
     }
-    return gather(parts);
+    float sum = parts[0];  // over the four lanes that share a pixel
+#pragma unroll
+    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
+    return sum;
   }
   __device__ float dot(const Eighth<C> (&splat)[8]) const {
     float own[kOwn];

@@ -109,8 +109,6 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     const int k = max(k1 - kBatch, 0) + int(threadIdx.x);
     return threadIdx.x < kBatch && k < k1 ? list.splat(k) : -1;
   };
-  // The staged splats in [from, from + 32) that reach this warp's subtile.
-  const auto reached = [&](int from) { return __ballot_sync(kAllLanes, shared.reach[from + lane] >> warp & 1); };
   int id = splat_of_batch(end);
   for (int k1 = end; k1 > 0; k1 -= kBatch) {
     const int k0 = max(k1 - kBatch, 0), count = k1 - k0;
@@ -142,7 +140,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     }
     id = next_id;
     for (int part = kBatch / 32 - 1; part >= 0; --part) {
-      uint32_t hits = 0, mask = reached(32 * part);
+      uint32_t hits = 0, mask = __ballot_sync(kAllLanes, shared.reach[32 * part + lane] >> warp & 1);
       while (mask != 0) {
         const int bit = 31 - __clz(mask), j = 32 * part + bit;
         mask ^= 1u << bit;
@@ -216,23 +214,19 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
+template <class F, int C> void launch_group_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  const LaunchShape blocks = {unsigned(p.grid.tiles()), kBlendThreads, sizeof(GroupVjpShared<F, C>)};
+  const bool with_shape = p.mean_sums == MeanSums::kNone || first == 0;
+  const auto kernel = with_shape ? blend_groups_vjp_kernel<F, C, true> : blend_groups_vjp_kernel<F, C, false>;
+  launch(kernel, blocks, stream, p, first);
+}
 /// The group that begins with channel `first`.
 template <class F> void launch_blend_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  const bool with_shape = p.mean_sums == MeanSums::kNone || first == 0;
-  const auto launch_group = [&](auto channels, auto shape) {
-    constexpr int C = decltype(channels)::value;
-    const LaunchShape blocks = {unsigned(p.grid.tiles()), kBlendThreads, sizeof(GroupVjpShared<F, C>)};
-    launch(blend_groups_vjp_kernel<F, C, decltype(shape)::value>, blocks, stream, p, first);
-  };
-  const auto launch_width = [&](auto channels) {
-    if (with_shape) return launch_group(channels, std::true_type());
-    launch_group(channels, std::false_type());
-  };
   if constexpr (!F::kGeneric) {
     if (group_width<F>(p.channels.count - first) == kSmallGroup)
-      return launch_width(std::integral_constant<int, kSmallGroup>());
+      return launch_group_vjp<F, kSmallGroup>(p, first, stream);
   }
-  launch_width(std::integral_constant<int, kChannelGroup>());
+  launch_group_vjp<F, kChannelGroup>(p, first, stream);
 }
 
 }  // namespace ar::cuda

@@ -25,15 +25,10 @@ template <class F, int C> void launch_blend(const BlendParams& p, cudaStream_t s
 }  // namespace
 
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (family_of<F>(kFewChannels) == Family::kStill) {
-      with_lanes<F>(p.grid, [&](auto of_lane) {
-        using OfLane = decltype(of_lane);
-        if (!p.channels.data) return launch_blend<OfLane, 3>(p, stream);
-        launch_blend<OfLane, kFewChannels>(p, stream);
-      });
-    }
+  visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
+    using F = decltype(of_lane);
+    if (!p.channels.data) return launch_blend<F, 3>(p, stream);
+    launch_blend<F, kFewChannels>(p, stream);
   });
 }
 

@@ -19,15 +19,10 @@ template <class F, int C> void launch_blend_vjp(const BlendVjpParams& p, cudaStr
 }  // namespace
 
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (family_of<F>(kFewChannels) == Family::kStill) {
-      with_lanes<F>(p.grid, [&](auto of_lane) {
-        using OfLane = decltype(of_lane);
-        if (!p.channels.data) return launch_blend_vjp<OfLane, 3>(p, stream);
-        launch_blend_vjp<OfLane, kFewChannels>(p, stream);
-      });
-    }
+  visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
+    using F = decltype(of_lane);
+    if (!p.channels.data) return launch_blend_vjp<F, 3>(p, stream);
+    launch_blend_vjp<F, kFewChannels>(p, stream);
   });
 }
 

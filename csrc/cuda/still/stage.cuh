@@ -28,26 +28,6 @@ template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   }
 };
 
-/// Composites a splat into a pixel; last[s] becomes `index` where it was composited into sample s.
-template <class F, int C, int kSets>
-__device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<float> p, int index,
-                                          PixelState<F::kSamples, C, kSets>& state, int (&last)[F::kSamples]) {
-  const auto composite_sample = [&](int s) {
-    const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
-    last[s] = b.mask ? index : last[s];
-    return b;
-  };
-  if constexpr (kSets == 1) {
-    add_samples<F::kSamples>(state.channels[0], splat.channels, composite_sample);
-  } else {
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s) {
-      const Blended<float> b = composite_sample(s);
-      if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
-    }
-  }
-}
-
 /// Composites the staged splats into a pixel; `index`: the number of the first of them in the tile's list.
 template <class F, int C, int kSets>
 __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec2<float> p,
@@ -60,7 +40,20 @@ __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec
   for (int from = 0; from < reached; from += kBetweenVotes) {
     if (!__any_sync(kAllLanes, state.open())) break;
     stage.for_each_listed(from, min(reached, from + kBetweenVotes), [&](TileSplatRef<F, C> splat, auto entry) {
-      composite<F>(splat, p, first + int(entry), state, last);
+      const auto composite = [&](int s) {
+        const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
+        last[s] = b.mask ? first + int(entry) : last[s];
+        return b;
+      };
+      if constexpr (kSets == 1) {
+        add_samples<F::kSamples>(state.channels[0], splat.channels, composite);
+      } else {
+#pragma unroll
+        for (int s = 0; s < F::kSamples; ++s) {
+          const Blended<float> b = composite(s);
+          if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
+        }
+      }
     });
   }
   if (Stage::kOffsets && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;

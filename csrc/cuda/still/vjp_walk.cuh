@@ -192,7 +192,8 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     put_grads(row, shape, weighted, channels, to);
     if constexpr (kMeans) {
       const float total = warp_sum_of_two(means.x, means.y);
-      if (lane_ % 16 == 0) put(row, kPairMeans + lane_ / 16, total);
+      if (lane_ % 16 == 0)
+        put_sum(params_.pair_grads, kPairGradWidth, list_.of_patch, row, kPairMeans + lane_ / 16, total);
     }
   }
 
@@ -231,11 +232,6 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       const Vec2<float> of_mean = mean_sums_of(kKind, chunk_.size, transform_transposed(mean_map, offset));
       if (writes_pixel<F>(lane_)) means = means + of_mean;
     }
-  }
-
-  /// Writes a sum of a pair.
-  __device__ void put(int32_t row, int column, float x) {
-    put_sum(params_.pair_grads, kPairGradWidth, list_.of_patch, row, column, x);
   }
 
   /// Adds the lanes' sums up and writes them to the pair's row, or leaves them at `to` for sum_pairs().
