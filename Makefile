@@ -23,7 +23,7 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
+.PHONY: demo test test-architectures test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
@@ -39,6 +39,20 @@ test-cpp: $(VENV)/.tools
 	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
 	$(CMAKE) --build $(BUILD)/cpp -j $(JOBS)
 	cd $(BUILD)/cpp && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
+
+# Every kernel for every architecture that a build without a GPU makes code for, warnings being errors. Needs nvcc
+# and no GPU. Prints the CPU time of each file.
+ARCHITECTURES ?= 75 80 90 100 120
+NVCC ?= $(shell command -v nvcc || echo /usr/local/cuda/bin/nvcc)
+CUDA_SOURCES := $(shell find csrc/cuda -name '*.cu')
+ARCHITECTURE_OBJECTS := $(foreach a,$(ARCHITECTURES),$(CUDA_SOURCES:csrc/cuda/%.cu=$(BUILD)/architectures/$a/%.o))
+test-architectures: $(ARCHITECTURE_OBJECTS)
+$(ARCHITECTURE_OBJECTS): $(BUILD)/architectures/%.o: FORCE
+	@mkdir -p $(dir $@)
+	@bash -c 'TIMEFORMAT="$* %U s"; time $(NVCC) -std=c++17 -O3 --fmad=false --expt-relaxed-constexpr -Icsrc \
+	  -Werror all-warnings -gencode arch=compute_$(firstword $(subst /, ,$*)),code=sm_$(firstword $(subst /, ,$*)) \
+	  -c csrc/cuda/$(patsubst $(firstword $(subst /, ,$*))/%,%,$*).cu -o $@'
+FORCE:
 
 # The C++ tests again, under AddressSanitizer and UndefinedBehaviorSanitizer.
 test-sanitized: $(VENV)/.tools

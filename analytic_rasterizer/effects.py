@@ -249,7 +249,8 @@ class Effects:
 
         Numbers, lists of numbers, or tensors.
         """
-        members = {"focus": 1.0, "near": self.near, "far": self.far, "parallel": float(self.orthographic)}
+        model = _C.CAMERA_MODELS.index("orthographic" if self.orthographic else "pinhole")
+        members = {"focus": 1.0, "near": self.near, "far": self.far, "model": float(model)}
         if self.defocus:
             members |= {"aperture": self.defocus.aperture, "focus": self.defocus.focus}
         if self.motion:

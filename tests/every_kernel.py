@@ -1,15 +1,19 @@
-"""Launches the CUDA kernels on scenes so small that compute-sanitizer ends within minutes.
+"""Launches every CUDA kernel on scenes so small that compute-sanitizer ends within minutes.
 
+    python tests/every_kernel.py [PART ...]
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer [--tool racecheck] python tests/every_kernel.py [PART ...]
 
-The parts are the footprints, and those at the end of this file. Each is rendered forward and backward in images of
-several kinds, which have different kernels. Without torch's cache of memory every tensor is an allocation of its own,
-so that memcheck notices what reaches beyond one. Nothing is compared here: the other tests do that.
+The parts are the footprints, and the others at the end of this file. Each footprint is rendered forward and backward
+in images of several kinds, which have different kernels. With all parts the program fails if the library has a kernel
+that was not launched; the names of kernels are in the file of the library. Without torch's cache of memory every tensor
+is its own allocation, so that memcheck notices accesses beyond it. Nothing is compared here: the other tests do that.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+import sys
 import tempfile
 from collections.abc import Sequence
 from functools import partial
@@ -21,7 +25,9 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
+from analytic_rasterizer.activations import activate
 from analytic_rasterizer.losses import l1_ssim, ssim
+from analytic_rasterizer.optim import FusedAdam
 
 
 class Image(NamedTuple):
@@ -48,8 +54,8 @@ class Image(NamedTuple):
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images of `moment`. Those of `box` with four
 # samples need 1024x1024, and only they are given so many. Lists of thousands of splats have chunks
-# behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/cut_lists.cuh) are cut in large
-# images too, and alone in small ones with 16 cells, and have a layout of their own. Where Gaussians are opaque,
+# after the front, and several segments; lists of kLongList pairs or more (csrc/cuda/tuning.h) are cut in large images
+# too, and alone in small ones with 16 cells, and have their own layout. Where Gaussians are opaque,
 # pixels close (so little light is left that 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
@@ -63,14 +69,18 @@ IMAGES = {
 LARGEST = Image(1024, 1024, 600)
 
 
-def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES), **settings) -> None:
-    """Pictures of random scenes and all of their gradients."""
+def render(
+    device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES), absolute: bool = False, **settings
+) -> None:
+    """Pictures of random scenes and all of their gradients; with `absolute` also sums of absolute gradients."""
     for image in map((IMAGES | {"largest": LARGEST}).get, images):
         leaves = scenes.leaves(image.scene(device))
         if channels != 3:
             del leaves["shs"]
             count = len(leaves["means3D"])
             leaves["colors_precomp"] = torch.rand(count, channels, device=device, requires_grad=True)
+        if absolute:
+            leaves["means2D"] = torch.zeros(len(leaves["means3D"]), 4, device=device, requires_grad=True)
         fields = image.camera().fields(torch.float32, device)
         fields |= {"sh_degree": 3, "bg": torch.zeros(channels, device=device)}
         rasterizer = ar.GaussianRasterizer(ar.GaussianRasterizationSettings(**fields, **settings))
@@ -81,11 +91,56 @@ def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES)
         sum(of_output.sum() for of_output in made).backward()
 
 
+# Lists that are cut and lists that are not, in large and in small images.
+FEW_IMAGES = ("large, few tiles", "small", "small, opaque")
+
+
+def footprint(device: str, images: Sequence[str] = FEW_IMAGES, **settings) -> None:
+    """Every number of channels that has its own kernels, with and without sums of absolute gradients, and `inspect`."""
+    render(device, images=IMAGES if images is FEW_IMAGES else images, **settings)
+    for channels in (1, 40):
+        render(device, channels=channels, images=images, **settings)
+    for channels in (3, 1, 40):
+        render(device, channels=channels, images=images[-2:], absolute=True, **settings)
+    render(device, images=images, effects=ar.Effects(gaussian_stats=True), **settings)
+
+
 def many_channels(device: str) -> None:
     for count in (1, 5, 32, 70):
-        render(device, channels=count, images=(*IMAGES, "largest"), footprint="box:samples=4")
-        render(device, channels=count, footprint="box:samples=16")
-        render(device, channels=count, footprint="analytic")
+        for name in ("box:samples=4", "box:samples=16", "analytic"):
+            render(device, channels=count, footprint=name)
+
+
+def sorts(device: str) -> None:
+    """Numbers of tiles that are sorted in one pass and in two, by digits of 7 and of 8 bits."""
+    for side in (64, 240, 1024, 2400):
+        image = Image(side, side, 300)
+        settings = image.camera().settings(torch.float32, device, footprint="point")._replace(sh_degree=3)
+        leaves = scenes.leaves(image.scene(device))
+        with torch.no_grad():
+            ar.GaussianRasterizer(settings)(**leaves)
+        ar.GaussianRasterizer(settings)(**leaves)[0].sum().backward()
+
+
+def weights(device: str) -> None:
+    for name, options in scenes.VARIANTS:
+        for dtype in (torch.float32, torch.float64):
+            offset = torch.rand(300, 2, dtype=dtype, device=device, requires_grad=True)
+            cov2d = torch.tensor([1.0, 0.2, 0.7], dtype=dtype, device=device).repeat(300, 1).requires_grad_()
+            ar.footprint_weight(offset, cov2d, name, **options).sum().backward()
+
+
+def stages(device: str) -> None:
+    """Two cameras in a batch, plain ones and others, each stage by itself."""
+    image = IMAGES["small, opaque"]
+    for effects in (None, ar.Effects(defocus=ar.Defocus(aperture=0.1, focus=3.0))):
+        settings = image.camera().settings(torch.float32, device, footprint="box:samples=1", effects=effects)
+        leaves = scenes.leaves(image.scene(device))
+        del leaves["means2D"]
+        splats = ar.project([settings._replace(sh_degree=3)] * 2, **leaves)
+        for channels in (3, 6):
+            features = None if channels == 3 else torch.rand(len(splats.depths), channels, device=device)
+            ar.blend(splats, ar.list_tiles(splats), features)[0].sum().backward(retain_graph=True)
 
 
 def too_many_pairs(device: str) -> None:
@@ -114,9 +169,22 @@ def effects(device: str) -> None:
 
 def losses(device: str) -> None:
     for size in ((3, 70, 90), (1, 5, 3)):
-        image = torch.rand(size, device=device, requires_grad=True)
-        target = (255 * torch.rand(size, device=device)).to(torch.uint8)
-        (l1_ssim(image, target) + ssim(image, target, "none").mean()).backward()
+        for dtype in (torch.float32, torch.float64):
+            image = torch.rand(size, dtype=dtype, device=device, requires_grad=True)
+            for target in (torch.rand_like(image).detach(), (255 * torch.rand(size, device=device)).to(torch.uint8)):
+                (l1_ssim(image, target) + ssim(image, target, "none").mean()).backward()
+
+
+def steps(device: str) -> None:
+    """What a training step has besides pictures, in both precisions."""
+    for dtype in (torch.float32, torch.float64):
+        numbers = {"dtype": dtype, "device": device}
+        leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
+        sum(made.sum() for made in activate(*leaves)).backward()
+        FusedAdam(leaves).step()
+        sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
+        radii = torch.ones(300, dtype=torch.int32, device=device)
+        torch.ops.analytic_rasterizer.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)
 
 
 def training(device: str) -> None:
@@ -131,10 +199,16 @@ def training(device: str) -> None:
         Run(f"{folder}/capture", f"{folder}/out", TrainingOptions(**options), device=device).train()
 
 
-PARTS = {scenes.name_of(variant): partial(render, footprint=variant[0], **variant[1]) for variant in scenes.RENDERED}
-PARTS |= {"largest": partial(render, images=("largest",), footprint="box:samples=4")}
-PARTS |= {"channels": many_channels, "pairs": too_many_pairs}
-PARTS |= {"effects": effects, "losses": losses, "training": training}
+PARTS = {scenes.name_of(variant): partial(footprint, footprint=variant[0], **variant[1]) for variant in scenes.VARIANTS}
+PARTS |= {"largest": partial(footprint, images=("large", "largest"), footprint="box:samples=4")}
+PARTS |= {"channels": many_channels, "pairs": too_many_pairs, "sorts": sorts, "stages": stages, "weights": weights}
+PARTS |= {"effects": effects, "losses": losses, "steps": steps, "training": training}
+
+
+def kernels_of_library() -> set[str]:
+    """Mangled names of the kernels in the library, which registers them with CUDA by these names."""
+    names = re.findall(rb"(?<=\0)_ZN2ar4cuda[A-Za-z0-9_]*kernel[A-Za-z0-9_]*(?=\0)", Path(_C.__file__).read_bytes())
+    return {name.decode() for name in names}
 
 
 def main() -> None:
@@ -142,11 +216,21 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--device", default="cuda")
     args = parser.parse_args()
+    on_cuda = args.device == "cuda"
+    if on_cuda:
+        _C.record_kernels(True)
     for name in args.parts:
         PARTS[name](args.device)
-        if args.device == "cuda":
+        if on_cuda:
             torch.cuda.synchronize()
         print(name, flush=True)
+    if not on_cuda:
+        return
+    known, launched = kernels_of_library(), set(_C.launched_kernels())
+    _C.record_kernels(False)
+    print(f"{len(launched & known)} of {len(known)} kernels were launched")
+    if launched - known or (known - launched and set(args.parts) == set(PARTS)):
+        sys.exit("\n".join(["not launched:", *sorted(known - launched), "unknown:", *sorted(launched - known)]))
 
 
 if __name__ == "__main__":

@@ -620,7 +620,7 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
 def test_every_kernel(device, monkeypatch, capsys):
     """The program for compute-sanitizer ends; the parts that render footprints are alike, so that one will do here."""
     program = importlib.import_module("every_kernel")
-    parts = ["box-4", "channels", "pairs", "effects", "losses", "training"]
+    parts = ["box-4", "channels", "pairs", "sorts", "stages", "weights", "effects", "losses", "steps", "training"]
     monkeypatch.setattr(sys, "argv", ["every_kernel.py", *parts, "--device", device])
     program.main()
     assert capsys.readouterr().out.split()[-len(parts) :] == parts
@@ -630,7 +630,7 @@ def test_every_kernel(device, monkeypatch, capsys):
 def test_every_kernel_has_images_that_need_it(footprint, options):
     """What its comment says of lists and of pixels that close."""
     program = importlib.import_module("every_kernel")
-    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "cut_lists.cuh").read_text())[1]
+    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "tuning.h").read_text())[1]
     longest, most_in_tile, closed, short = {}, {}, {}, {}
     for name, image in program.IMAGES.items():
         settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)

@@ -254,9 +254,7 @@ def test_depths_that_differ_in_the_last_bit(device):
         assert first.tolist() == [2, 1, 0], dtype
 
 
-@pytest.mark.parametrize(
-    "samples, large, small", [(1, 16, 8), (4, 8, 8), (9, 8, 4), (16, 8, 4)], ids=["1", "4", "9", "16"]
-)
+@pytest.mark.parametrize("samples, large, small", [(1, 16, 8), (4, 8, 8), (16, 8, 4)], ids=["1", "4", "16"])
 def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
     """On CUDA: an image is large from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
     key = resolve_footprint("moment", samples=samples).key
@@ -264,7 +262,7 @@ def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
     assert [_C.tile_size(key, 1.0, width, 512, False) for width in (512, 504)] == [16, 16]
 
 
-@pytest.mark.parametrize("samples, large, small", [(1, 16, 16), (2, 16, 16), (4, 16, 8), (8, 16, 16), (16, 4, 4)])
+@pytest.mark.parametrize("samples, large, small", [(1, 16, 16), (4, 16, 8), (16, 4, 4)])
 def test_tiles_of_samples_spread_over_lanes(samples, large, small):
     """On CUDA: four samples are spread in images of less than 4096 tiles of 16x16 px, and sixteen in all."""
     key = resolve_footprint("box", samples=samples).key

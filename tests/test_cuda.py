@@ -7,6 +7,7 @@ rare pixels. Everything else agrees closely, and CUDA agrees with itself to the 
 
 import gc
 import math
+import re
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import pytest
 import scenes
 import torch
 from conftest import in_threads, needs_cuda
-from scenes import KINDS, PATHS, RENDERED, Camera, name_of
+from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
@@ -351,6 +352,40 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
     color = compare(scene, settings, flips=1e-3, layers=500)
     assert_same_without_gradient(scene, settings, color)
     assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
+
+
+def launched_kernels(run):
+    """(what run() returns, the kernels of blending that it launches, without their template arguments)."""
+    _C.record_kernels(True)
+    try:
+        made = run()
+        names = {re.search(r"\d([a-z_]+_kernel)", name)[1] for name in _C.launched_kernels()}
+    finally:
+        _C.record_kernels(False)
+    blending = r"blend|tail|filter|vjp_kernel|maps"
+    return made, {name for name in names if re.search(blending, name) and not name.startswith("project")}
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+@pytest.mark.parametrize("channels", [3, 1, 40])
+@pytest.mark.parametrize("camera", [CAMERA, LARGE, LARGEST], ids=lambda camera: str(camera.image_width))
+def test_the_kernels_of_a_picture_are_those_of_the_table(variant, channels, camera):
+    """csrc/cuda/dispatch.h says which kernels blend a footprint, forward and backward."""
+    scene, settings = scene32("few"), settings_for(variant, camera, "cuda")
+    if channels != 3:
+        scene, settings = with_channels(scene, settings, channels)
+        settings = scenes.settings_to(settings, "cuda")
+    capacity, leaves = 1 << 16, scenes.leaves(scenes.to(scene, "cuda"))
+    size = (camera.image_width, camera.image_height)
+    forward, backward = _C.blend_route(settings.footprint.key, channels, *size, capacity)
+    _C.force_pair_capacity(capacity)
+    try:
+        image, launched = launched_kernels(lambda: ar.GaussianRasterizer(settings)(**leaves)[0])
+        assert launched == set(forward)
+        _, launched = launched_kernels(lambda: image.sum().backward())
+        assert launched == set(backward)
+    finally:
+        _C.force_pair_capacity(0)
 
 
 @pytest.mark.parametrize("samples, camera", [(1, LARGE), (4, LARGE), (16, CAMERA)], ids=["16x16", "8x8", "4x4"])

@@ -294,7 +294,7 @@ def test_rows_of_tiles_that_splats_touch(footprint, size, device):
     del scene["means2D"]
     settings = scenes.settings_to(settings_of(footprint, torch.float32, camera), device)
     splats = ar.project(settings, **scene)
-    touched = _touched(splats, settings.bg)
+    touched = _touched(splats)
     lists = ar.list_tiles(splats, keep=False).of_camera()
     rows = -(-camera.image_height // touched.side)
     tiles = rows * -(-camera.image_width // touched.side)

@@ -66,7 +66,7 @@ def test_too_many_splats(device, op, rows):
     mip = ar.resolve_footprint("mip")
     arguments |= {"footprint": mip.key, "option": mip.option}
     if op == "bin":
-        arguments |= {"depths": repeated(rows, device=device), "colors": None, "background": None}
+        arguments |= {"depths": repeated(rows, device=device)}
     else:
         features, background = repeated(rows, 3, device=device), torch.zeros(1, 3, device=device)
         arguments |= {"features": features, "background": background, "means2d_abs": None, "lists": []}

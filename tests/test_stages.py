@@ -240,6 +240,22 @@ def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
     )
 
 
+@each_precision
+def test_a_depth_of_minus_zero_is_zero(device, dtype):
+    """The caller's depths may have either sign of zero. Both are nearer than all others, and equal to each other."""
+    splats = ar.project(settings_of(dtype, device), **scene_of(dtype, device))
+    depths, mixed = splats.depths.clone(), splats.depths.clone()
+    depths[::2] = mixed[::2] = 0.0
+    mixed[::4] = -0.0
+    pictures = []
+    for given in (splats.depths, depths, mixed):
+        rows = dataclasses.replace(splats, depths=given)
+        pictures.append(ar.blend(rows, ar.list_tiles(rows))[0])
+    in_order, zeros, signed = pictures
+    assert torch.equal(signed, zeros)
+    assert not torch.equal(zeros, in_order)  # the depths of zero do change the order
+
+
 def test_a_channel_that_is_not_finite_culls_its_gaussian(device):
     settings = settings_of(torch.float32, device)._replace(bg=torch.zeros(8, device=device))
     scene = scene_of(torch.float32, device)

@@ -1,6 +1,6 @@
-// From what a training optimises to what the rasterizer takes: exp of the logarithms of the scales, the quaternion
-// divided by its length, the logistic function of the logit of the opacity; and the adjoint, which computes the values
-// again from the parameters, so that nothing has to be kept.
+// From the parameters that a training optimises to the rasterizer's: exp of scales, quaternions divided by their
+// length, the logistic function of opacities; and the adjoint, which computes the values again. cpu/activations.cpp and
+// cuda/activations.cu run both over the Gaussians.
 #pragma once
 
 #include <cmath>
@@ -9,7 +9,7 @@
 
 namespace ar {
 
-/// A quaternion is divided by no less than this, as torch.nn.functional.normalize does.
+/// The least divisor of a quaternion, as in torch.nn.functional.normalize.
 inline constexpr double kMinQuaternionLength = 1e-12;
 
 template <typename T> struct ActivateParams {
@@ -22,7 +22,7 @@ template <typename T> struct ActivateParams {
   T* opacities;
 };
 
-/// Gradients that are null are zero where they are read, and not wanted where they are written.
+/// A gradient that is null is zero if it is read, and not wanted if it is written.
 template <typename T> struct ActivateVjpParams {
   int64_t n;
   const Vec3<T>* log_scales;
@@ -52,7 +52,7 @@ template <typename T> AR_HD Vec4<T> rotation_of(Vec4<T> q) {
 template <typename T> AR_HD Vec4<T> rotation_of_vjp(Vec4<T> q, Vec4<T> g) {
   const T norm = sqrt(dot(q, q)), length = max(norm, T(kMinQuaternionLength));
   const Vec4<T> r = {q.x / length, q.y / length, q.z / length, q.w / length};
-  // Shorter ones are divided by a constant.
+  // A shorter quaternion is divided by a constant.
   const T along = norm < T(kMinQuaternionLength) ? T(0) : dot(r, g);
   return {(g.x - along * r.x) / length, (g.y - along * r.y) / length, (g.z - along * r.z) / length,
           (g.w - along * r.w) / length};

@@ -1,5 +1,5 @@
-// Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for blocks of
-// pixels.
+// Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for boxes of
+// pixels. project.h culls by the extents, bin lists the tiles, and blend tests boxes.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -7,8 +7,7 @@
 
 namespace ar {
 
-/// The ellipse |w (x - mean)|^2 <= level, grown by `reach` px in x and y so that it covers every
-/// sample of a pixel, and the numbers its extents need.
+/// The ellipse |w (x - mean)|^2 <= level, grown by `reach` px in x and y so that it covers every sample of a pixel.
 template <typename T> struct Support {
   Vec2<T> mean;
   T level, reach;
@@ -21,10 +20,9 @@ template <typename T> struct Support {
 
 template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>& w, T level, T reach) {
   const T a = w.xx * w.xx + w.yx * w.yx, b = w.xx * w.xy + w.yx * w.yy, c = w.xy * w.xy + w.yy * w.yy;
-  // det w without cancellation: one entry of a Cholesky factor is zero, eigenframes are orthogonal
   const T det = difference_of_products(w.xx, w.yy, w.xy, w.yx);
   const T l = level + T(kLevelSlack);
-  // Extents may be approximations, since kLevelSlack is for much larger errors; the slope of a needle may not.
+  // kLevelSlack covers approximate extents, but not an approximate slope of a needle.
   const T scale = divide(approx_sqrt(l), abs(det)), inv_a = quotient(T(1), a), root_c = approx_sqrt(c);
   return {mean,       l,     reach,    scale * root_c, scale * approx_sqrt(a), -scale * divide(b, root_c),
           -b * inv_a, inv_a, det * det};
@@ -34,7 +32,6 @@ template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& sp
   return make_support(splat.mean, F::ellipse(splat.shape), splat.level, T(F::kReach));
 }
 
-/// Copies a shape into or out of a row whose footprint is known at run time.
 template <class F, typename T> AR_HD void set_shape(SplatRow<T>& row, const typename F::template Shape<T>& shape) {
   static_assert(sizeof shape == sizeof row.shape, "a Shape is an aggregate of kShapeWidth numbers");
   memcpy(row.shape, &shape, sizeof shape);
@@ -45,7 +42,6 @@ template <class F, typename T> AR_HD typename F::template Shape<T> shape_of(cons
   return shape;
 }
 
-/// The support of a splat whose footprint is at place `footprint` of the registry.
 template <typename T> AR_HD Support<T> support_of(const SplatRow<T>& row, int footprint) {
   Mat2<T> w = {};
   T reach = T(0);
@@ -57,20 +53,19 @@ template <typename T> AR_HD Support<T> support_of(const SplatRow<T>& row, int fo
   return make_support(row.mean, w, row.level, reach);
 }
 
-/// Closed interval of pixel coordinates; empty where hi < lo.
+/// A closed interval of pixel coordinates; empty if hi < lo.
 template <class V> struct Span {
   V lo, hi;
 };
 
-/// Pixel rows whose centres the support reaches, before clamping to the image.
+/// The pixel rows that the support reaches, in the image or not.
 template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
   const T half = s.half_height + s.reach;
   return {s.mean.y - half, s.mean.y + half};
 }
 
-/// Extent in x of the part of the support with y in [y0, y1] (pixel centres). Exact, because the
-/// intersection of an ellipse and a band is convex: its extremes are at the ellipse's tips or, where
-/// those lie outside the band, at the band's edge towards them.
+/// Exact extent in x of the part of the support with y in [y0, y1]. The intersection of an ellipse and a band is
+/// convex: its extremes are at the tips of the ellipse or, if these are outside, at the nearer edge of the band.
 template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) {
   const T height = s.half_height, zero = T(0);
   const T lo = max(y0 - (s.mean.y + s.reach), -height), hi = min(y1 - (s.mean.y - s.reach), height);
@@ -82,41 +77,38 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// What says whether a support reaches boxes of one size. In the coordinates in which the ellipse is a circle,
-/// z = w (x - mean), a box of pixels lies in a box around its centre: where the circle does not reach the second, the
-/// ellipse does not reach the first. This takes neither a division nor a root, but for a box that the ellipse passes
-/// closely it may say yes although the ellipse does not reach it.
+/// A test whether a support reaches boxes of one size, without division and root. In the coordinates z = w (x - mean)
+/// the ellipse is a circle. The test compares it with a box that surrounds the box of pixels there, so that it may say
+/// yes if the ellipse passes closely.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
 };
 
-/// `half`: of the boxes, between the centres of their outermost pixels and with the reach of samples [px]. `distance`:
-/// in x and in y no box has its centre farther from the mean [px]. Rounding of z grows with it and with w, which
-/// kLevelSlack does not cover for splats much thinner than a pixel.
+/// `half`: half the size of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's
+/// centre to the mean [px]. Rounding of z grows with it and with w, more than kLevelSlack for thin splats.
 template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
   const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
   return {{abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
 }
 
-/// Whether the box is reached whose centre is at z.
 template <typename T, class V> AR_HD MaskOf<V> reaches_box(const BoxReach<T>& s, Vec2<V> z) {
   const V zero = V(T(0)), x = max(abs(z.x) - V(s.half.x), zero), y = max(abs(z.y) - V(s.half.y), zero);
   return madd(x, x, y * y) <= V(s.level);
 }
 
-/// Integers in [lo, hi] that lie in [0, n), as [first, last]; empty where last < first.
+/// Integers [first, last]; empty if last < first.
 struct Range {
   int first, last;
 };
 template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {
-  // Clamped before the conversion: a float beyond the range of int has no conversion.
+  // Clamped before the conversion, which is undefined for a float beyond the range of int.
   const T lo = max(span.lo, T(0)), hi = min(span.hi, T(n - 1));
   if (!(lo <= hi)) return {0, -1};
   return {int(std::ceil(lo)), int(std::floor(hi))};
 }
 
-/// Whether the bounding box of the support holds the centre of a pixel's row and column.
+/// Whether the bounding box of the support contains a pixel centre.
 template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid grid) {
   const T half = s.half_width + s.reach;
   const Range rows = clamp_range(rows_of(s), grid.height);
@@ -124,40 +116,48 @@ template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid gri
   return rows.first <= rows.last && columns.first <= columns.last;
 }
 
-/// Tiles that hold a range of pixels.
 AR_HD Range tiles_of(Range pixels, TileGrid grid) {
   return pixels.first <= pixels.last ? Range{pixels.first >> grid.tile_bits, pixels.last >> grid.tile_bits}
                                      : Range{0, -1};
 }
 
-/// Columns of the tiles that the support touches in a row of tiles; `rows` are its rows of pixels.
+/// Columns of the tiles that the support touches in a row of tiles. `rows`: its rows of pixels.
 template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
   const int top = tile_row << grid.tile_bits, bottom = top + grid.side() - 1;
   const T y0 = T(max(top, rows.first)), y1 = T(min(bottom, rows.last));
   return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width), grid);
 }
 
-/// Calls visit(tile row, range of tile columns) for every row of tiles that the support may touch.
+/// Calls visit(tile row, range of tile columns).
 template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>& s, TileGrid grid, Visit&& visit) {
   const Range rows = clamp_range(rows_of(s), grid.height), tile_rows = tiles_of(rows, grid);
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// Tiles among 8x8: bit 8 r + c is the one in row r and column c.
+/// The bits of a depth >= 0, by which bin sorts: as unsigned integers they have the order of the depths. -0 counts as
+/// 0.
+template <typename T> AR_HD auto depth_bits(T depth) {
+  std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
+  const T without_sign = depth + T(0);
+  static_assert(sizeof bits == sizeof without_sign);
+  memcpy(&bits, &without_sign, sizeof bits);
+  return bits;
+}
+
+/// Tiles among 8x8: bit 8 r + c is the tile in row r and column c.
 using TileMask = uint64_t;
 
-/// The tiles that a support touches, and where the mask of them begins.
+/// The tiles that a support touches. The mask begins at `row` and `column`.
 struct TileBox {
-  TileMask mask;  ///< 0: none, or not all are among 8x8
+  TileMask mask;  ///< 0 if the support touches no tile, or tiles outside of these 8x8
   int row, column, count;
 };
 template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGrid grid) {
-  // A mask begins with the first of the tiles that the support's bounding box touches.
   const Range rows = tiles_of(clamp_range(rows_of(support), grid.height), grid);
   const T half = support.half_width + support.reach;
   const Span<T> columns = {support.mean.x - half, support.mean.x + half};
   TileBox found = {0, rows.first, tiles_of(clamp_range(columns, grid.width), grid).first, 0};
-  int begin = 0, end = 0;  // of all columns, from the first; rounding may put one in front of the bounding box
+  int begin = 0, end = 0;  // of all columns; by rounding a column may be before `found.column`
   for_each_tile_row(support, grid, [&](int, Range range) AR_HD_LAMBDA {
     const int first = range.first - found.column, width = range.last - range.first + 1;
     uint32_t bits = 0;
@@ -174,7 +174,7 @@ template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGr
   return found;
 }
 
-/// Calls visit(tile index) for every tile the support touches, rows first, columns ascending.
+/// Calls visit(tile index), rows first, columns ascending.
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
   for_each_tile_row(s, grid, [&](int row, Range columns) AR_HD_LAMBDA {
     for (int column = columns.first; column <= columns.last; ++column) visit(int64_t(row) * grid.columns() + column);

@@ -1,8 +1,8 @@
 // Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
-// adjoint"). The loops over pixels and splats are in cpu/blend.h and cuda/blend*.cuh.
+// adjoint"). A library for the loops over pixels and splats in cpu/ and cuda/.
 //
 // T is the transmittance of a sample: the share of light that the splats so far let through. `raw` is opacity * weight
-// of a splat at the sample, before it is capped and thresholded to alpha. V is a scalar or a pack of lanes.
+// of a splat at the sample, before the cap and the threshold that make it alpha. V is a scalar or a pack of lanes.
 #pragma once
 
 #include <type_traits>
@@ -13,30 +13,26 @@
 
 namespace ar {
 
-// The sign of a sample's transmittance says whether the sample is open, that is, still takes splats. A sample that has
-// stopped keeps the value that it stopped at, negated: further splats leave it as it is.
+// The sign of a transmittance says whether the sample is open. A sample that stops negates its transmittance, and no
+// later splat changes it.
 
-/// Alpha of a splat in a sample: zero below kAlphaMin, and no more than kAlphaMax.
 template <class V> AR_HD V effective_alpha(V raw) {
   using T = ScalarOf<V>;
   return select(raw >= V(T(kAlphaMin)), min(raw, V(T(kAlphaMax))), V(T(0)));
 }
 
-/// Result of compositing one splat into one sample.
 template <class V> struct Blended {
   MaskOf<V> mask;  ///< whether the splat was composited
-  V contribution;  ///< T alpha; zero where it was not
-  V if_shown;      ///< T alpha where it was; to be read only there
+  V contribution;  ///< T alpha; zero outside the mask
+  V if_shown;      ///< T alpha; not to be read outside the mask
 };
 
-/// T <- T (1 - alpha). A splat that would take T below kTransmittanceMin is not composited and stops the sample, as in
-/// 3DGS.
+/// T <- T (1 - alpha). As in 3DGS, a splat that would lower T below kTransmittanceMin stops the sample instead.
 template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
   const MaskOf<V> hit = raw >= V(T(kAlphaMin));
-  // The same bits in two ways. A thread of a device is quicker where alpha need not be zero without a hit, packs of
-  // lanes where the transmittance is selected once.
+  // Two forms with the same bits: the first is quicker for a thread of a GPU, the second for packs of lanes.
   if constexpr (std::is_same_v<MaskOf<V>, bool>) {
     const V if_shown = transmittance * min(raw, V(T(kAlphaMax))), next = transmittance - if_shown;
     const bool mask = hit & (next >= V(T(kTransmittanceMin)));
@@ -51,15 +47,14 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   }
 }
 
-/// What a sample carries from splat to splat besides its transmittance: nothing, unless the footprint's samples move
-/// (kMoves of contract.h). Callers set it to zero in front of the first splat; a member initialiser is not possible for
-/// packs of lanes.
+/// What a sample that moves (kMoves of footprint/contract.h) carries from splat to splat besides its transmittance.
+/// Callers set it to zero before the first splat.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
   Vec2<V> moved;  ///< displacement from the sample's node [px]
 };
 
-/// Composites one splat into sample s of the pixel at p, for any footprint; P is what it is blended as (PixelsOf).
+/// The same for sample s of the pixel at p. P is PixelsOf the footprint.
 template <class P, class Terms, class V>
 AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmittance,
                               SampleState<V, P::kMoves>& state) {
@@ -76,8 +71,8 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// The same for a P whose samples move, in the form in which both devices blend: `place` is where the sample's node is,
-/// which stays within `cell`, Bounds or UnitCell; z are its whitened coordinates; `raw` is opacity * weight there.
+/// The same for a sample that moves, with its position `place`, which stays within `cell` (Bounds or UnitCell), and its
+/// whitened coordinates z.
 template <class P, class Terms, class V, class Cell>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
@@ -88,9 +83,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// Repeats blend_placed_sample in the backward pass, which needs the state in front of every splat. `before`: the splat
-/// is the last one that the forward pass composited into the sample, or in front of it, so that nothing has to be
-/// compared with kTransmittanceMin again. Returns whether the splat was composited.
+/// Repeats blend_placed_sample in the backward pass. `before`: the splat is not later than the last splat that the
+/// forward pass composited, so that kTransmittanceMin need not be tested. Returns whether the splat was composited.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
@@ -102,19 +96,17 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
   return mask;
 }
 
-/// Adjoint of compositing one splat into one sample.
 template <class V> struct BlendGrad {
-  V contribution;         ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
+  V contribution;         ///< T alpha, zero outside the mask
   AlphaGrad<V> of_alpha;  ///< zero outside the mask and where alpha is capped
 };
 
-/// Adjoint of blend_sample, called from the last splat to the first.
+/// Adjoint of blend_sample, called from the last splat to the first. `mask`: the forward pass composited the splat.
 ///
-/// `mask` says which samples the forward pass composited this splat into. `g_color` is the scalar product of the
-/// pixel's gradient and the colour of the splat, and `behind` (B of docs/numerics.md) that of the pixel's gradient and
-/// the colour of everything behind the splat, background included, as seen through this splat alone. `transmittance`
-/// and `behind` are read as they are behind the splat and left as they are in front of it. This recursion from the back
-/// never forms the difference of the total and a prefix, which cancels in deep stacks.
+/// `g_color` is the scalar product of the pixel's gradient and the splat's colour. `behind` (B of docs/numerics.md) is
+/// that product for the colour of all later splats and the background, as seen through this splat alone. On entry
+/// `transmittance` and `behind` are as after the splat, on return as before it. The recursion avoids the difference of
+/// the total and a prefix, which cancels in deep stacks.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -128,26 +120,24 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
           {select(free, transmittance * difference, zero), select(free, contribution * difference, zero)}};
 }
 
-/// What compositing one splat into samples that move adds to the sums of the splat.
 template <class V> struct MovingBlendGrad {
   V contribution;  ///< as in BlendGrad
   MoveGrad<V> of_splat;
 };
-/// Sums that nothing has been added to: -0, since the compiler knows that -0 + x is x.
+/// Zero sums: -0, since the compiler knows that -0 + x is x.
 template <class V> AR_HD MovingBlendGrad<V> no_moving_blend_grad() {
   const V zero = V(ScalarOf<V>(-0.0));
   return {zero, {zero, {{zero, zero}, {zero, zero, zero}}}};
 }
 
-/// Adjoint of blend_placed_sample, added to `sums`. `raw` is zero where the splat was not composited; `place` is that
-/// in front of the splat. `transmittance`, `behind` and dL_dplace, in the unit kMoveGradUnit of P, are read as they are
-/// behind the splat and left as they are in front of it.
+/// Adjoint of blend_placed_sample, added to `sums`. `raw` is zero where the splat was not composited, `place` is the
+/// position before it, and dL_dplace has the unit kMoveGradUnit of P.
 template <class P, class Terms, class V, class Cell>
 AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color, Vec2<V> place,
                                  V& transmittance, V& behind, Vec2<V>& dL_dplace, MovingBlendGrad<V>& sums) {
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
-  const V contribution = transmittance * odds(alpha);  // T behind the splat is 1 - alpha times that in front
+  const V contribution = transmittance * odds(alpha);  // T after = (1 - alpha) T before
   transmittance = transmittance + contribution;
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);
@@ -156,24 +146,23 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                sums.of_splat);
 }
 
-/// How `behind` and dL_dplace of add_placed_sample_vjp go through a part of a list. In front of it
-///   behind = (color + (transmittance behind it) * (behind it)) / (transmittance in front of it),
-///   dL_dplace = of_color + of_behind * (behind it) + of_place (dL_dplace behind it).
+/// How a segment of a list changes `behind` and dL_dplace of add_placed_sample_vjp. Before the segment
+///   behind = (color + T after * behind after) / T before,
+///   dL_dplace = of_color + of_behind * (behind after) + of_place (dL_dplace after).
 template <class V> struct AdjointMap {
   V color;
   Vec2<V> of_color, of_behind;
   Mat2<V> of_place;
 };
 
-/// Composites one more splat at the end of the part, as replay_placed_sample does. `mask`: the forward pass has
-/// composited it.
+/// Appends one splat to the segment. `mask`: the forward pass composited the splat.
 template <class P, class Terms, class V, class Cell>
 AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mask, const Cell& cell, V g_color,
                              V& transmittance, Vec2<V>& place, AdjointMap<V>& map) {
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // Behind this splat are B and l. What the map gets is B + alpha (g - B) and J^T l + T (g - B) dalpha.
+  // With B and l after this splat, B + alpha (g - B) and J^T l + T (g - B) dalpha before it enter the old map.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),
@@ -190,8 +179,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
        select(slope.free_y, yy, zero)};
 }
 
-/// What a pixel adds to the sums that density control asks for with `sums`, which is not kNone. `size`: of the image
-/// [px]; dL_dmean: the pixel's part of the gradient with respect to the splat's mean [1/px].
+/// What a pixel adds to the two sums of `sums`, which is not kNone. dL_dmean: the pixel's share of the gradient [1/px].
 template <class V, typename T> AR_HD Vec2<V> mean_sums_of(MeanSums sums, Vec2<T> size, Vec2<V> dL_dmean) {
   if (sums == MeanSums::kAbsolute) return {abs(dL_dmean.x), abs(dL_dmean.y)};
   const V x = V(T(0.5) * size.x) * dL_dmean.x, y = V(T(0.5) * size.y) * dL_dmean.y;

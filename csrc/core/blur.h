@@ -1,19 +1,18 @@
-// Defocus and motion blur of a projected Gaussian: both add to its covariance in the image, and lower its amplitude so
-// that it keeps its mass.
+// Applies the Blur of lens and shutter to a projected Gaussian: adds to its covariance, and lowers its amplitude so
+// that the mass stays the same. project.h calls seen_covariance and its adjoint.
 #pragma once
 
 #include "core/covariance.h"
 
 namespace ar {
 
-/// Sigma after the streak of motion, and after the defocus too.
 template <typename T> struct BlurredCov {
-  Cov2d<T> streaked, all;
-  Vec2<T> adj_streak;  ///< adj(Sigma) streak
+  Cov2d<T> streaked, all;  ///< Sigma with the streak; with streak and defocus
+  Vec2<T> adj_streak;      ///< adj(Sigma) streak
 };
 
-/// Products of adj(Sigma) with the streak are sums of the factors' products. Worked out from the entries of Sigma they
-/// would cancel for a needle along the streak.
+/// Products of adj(Sigma) with the streak are sums of products of the factors: from the entries of Sigma they would
+/// cancel for a needle along the streak.
 template <typename T>
 AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t i, const Blur<T>& by) {
   const Vec2<T>& b = by.streak;
@@ -25,7 +24,7 @@ AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t 
   return {streaked, blur(streaked, by.variance), {dot(y, weighted), -dot(x, weighted)}};
 }
 
-/// The covariance that the footprint sees, and the amplitude that keeps the mass of the splat.
+/// The covariance that the footprint gets, and a factor of the opacity.
 template <typename T> struct SeenCov {
   Cov2d<T> cov;
   T amp;
@@ -38,7 +37,7 @@ AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64
     const Blur<T> by = blur_of(camera, view);
     if (by.any()) {
       const Cov2d<T>&c = f.cov, all = blurred(f, g, i, by).all;
-      // What is negative definite has a positive determinant, and what is added may hide it.
+      // A negative definite matrix has a positive determinant, and a blur may hide it.
       const bool has_mass = c.det >= T(kMinBlurredDet) && c.xx >= T(0) && c.yy >= T(0);
       return {all, has_mass ? sqrt(c.det / all.det) : T(0)};
     }
@@ -46,34 +45,33 @@ AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64
   return {f.cov, T(1)};
 }
 
-/// 1 / sqrt(a b), whose product no float may hold.
+/// 1 / sqrt(a b), where a b may overflow.
 template <typename T> AR_HD T inverse_root(T a, T b) { return T(1) / (sqrt(a) * sqrt(b)); }
 
-/// What the adjoint of a blurred covariance needs. Without blur, B = NoBlur, it needs nothing.
 template <class B, typename T> struct BlurContext {
   B blur;
   BlurredCov<T> cov;
-  T weighted;  ///< gradient with respect to the logarithm of its amplitude
+  T weighted;  ///< gradient with respect to the logarithm of the amplitude
 };
 template <typename T> struct BlurContext<NoBlur, T> {};
 
-/// Gradient with respect to Sigma of the logarithm of a blur's amplitude, as a matrix.
+/// Gradient of the logarithm of the amplitude with respect to Sigma.
 template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance, const BlurredCov<T>& cov) {
   const T inv = inverse_root(c.det, cov.streaked.det), x = inv * cov.adj_streak.x, y = inv * cov.adj_streak.y;
   return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);
 }
 
-/// Gradient with respect to the blur itself. Of its amplitude only det Sigma' depends on it: -Sigma'^-1 b and
-/// -tr(Sigma'^-1) / 2 (docs/numerics.md, "Gradient with respect to a blur").
+/// Gradient with respect to the blur. The amplitude depends on it by det Sigma': -Sigma'^-1 b and -tr(Sigma'^-1) / 2
+/// (docs/numerics.md, "Gradient with respect to a blur").
 template <typename T>
 AR_HD Blur<T> seen_covariance_vjp(const SplatGrad<T>& grad, const BlurContext<Blur<T>, T>& context) {
   const Vec2<T>& b = context.blur.streak;
   const Cov2d<T>& all = context.cov.all;
   const T v = context.blur.variance, u = grad.variance;
   const Vec2<T> adj_b = {context.cov.adj_streak.x + v * b.x, context.cov.adj_streak.y + v * b.y};  // adj(Sigma') b
-  // What the footprint gives across a thin needle, g.yy, may cancel the amplitude. w^T w = (Sigma' + u I)^-1 is known
-  // without w, so that both multiply the same numbers; what remains is taken in whitened coordinates, as its entries
-  // cancel for a needle along the streak.
+  // For a thin needle the footprint's g.yy may cancel the amplitude. w^T w = (Sigma' + u I)^-1 is known without w, so
+  // that both multiply the same numbers. The remainder needs whitened coordinates, as its entries cancel along the
+  // streak.
   const Cov2d<T> seen = blur(all, u);
   const T across = grad.frame == GradFrame::kPixels ? T(0) : grad.dL_dwhite.yy;
   const T own = across / seen.det, inv = context.weighted / all.det;

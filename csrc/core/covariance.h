@@ -1,21 +1,20 @@
-// Scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31]. The adjoint
-// is in covariance_vjp.h.
+// From scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31].
+// project.h calls it; the adjoint is in covariance_vjp.h.
 #pragma once
 
 #include "core/camera.h"
 
 namespace ar {
 
-/// A unit quaternion, and what normalising it divided by.
 template <typename T> struct UnitQuaternion {
   T w, x, y, z;
-  T inv_norm;  ///< no more than kMaxQuaternionGrad; 0 for a zero quaternion: the identity, without gradient
+  T inv_norm;  ///< of the quaternion as given, at most kMaxQuaternionGrad; 0 for zero, the identity without gradient
 };
 
-/// Deviates from 3DGS, which expects unit quaternions from the caller: any length survives.
+/// Deviates: 3DGS expects unit quaternions.
 template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
-  // Vec4 (x, y, z, w) holds the quaternion's (w, x, y, z). Dividing by the largest first keeps the squares of tiny and
-  // huge ones in range, and a power of two before that, which rounds nothing, the divisions.
+  // Vec4 (x, y, z, w) is the quaternion (w, x, y, z). The division by the largest keeps squares in range, the power of
+  // two keeps the division in range without rounding.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
   // max() may drop a NaN; the sum does not.
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
@@ -33,8 +32,7 @@ template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
            {two * (q.x * q.z - q.w * q.y), two * (q.y * q.z + q.w * q.x), one - two * (q.x * q.x + q.y * q.y)}}};
 }
 
-/// Gradient with respect to the quaternion as given, stored like it, from the gradient with respect to a turn about the
-/// axes it turns to: R <- R exp([turn]x). It has no component along the quaternion.
+/// Gradient with respect to the quaternion as given and stored, from that with respect to a turn R <- R exp([turn]x).
 template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL_dturn) {
   const Vec3<T> raw = (T(2) * q.inv_norm) * dL_dturn;
   const T limit = T(kMaxQuaternionGrad);
@@ -43,8 +41,8 @@ template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL
           q.w * t.z + q.x * t.y - q.y * t.x};
 }
 
-/// Factors of the projected covariance of one Gaussian. From scale and rotation: Sigma = V V^T with
-/// V = A R S. From cov3d: Sigma = A cov3d A^T.
+/// Sigma = V V^T with V = A R S, of scale and rotation; Sigma = A cov3d A^T, of a 3D covariance, without the members
+/// from `quaternion` to `normal`.
 template <typename T> struct Factors {
   Jacobian<T> jacobian;
   UnitQuaternion<T> quaternion;
@@ -72,7 +70,7 @@ AR_HD Factors<T> project_covariance(const Cam& camera, const Gaussians<T>& g, in
     const Sym3<T>& c = g.cov3ds[i];
     const Vec3<T> cx = c * ax, cy = c * ay, n = cross(ax, ay);
     f.cov = {dot(ax, cx), dot(ax, cy), dot(ay, cy), dot(n, adjugate_times(c, n))};
-    // The entries of a needle, rounded to float, make no covariance any more but by this little.
+    // Entries of a needle that were rounded to float.
     if (f.cov.det < T(0) && f.cov.det >= T(-kSingular) * f.cov.xx * f.cov.yy) f.cov.det = T(0);
   } else {
     f.quaternion = normalize_quaternion(g.rotations[i]);

@@ -1,12 +1,12 @@
-// The adjoint of covariance.h: from the gradient with respect to the covariance in the image to those with respect to
-// scale and rotation, or to a 3D covariance, and to the camera's Jacobian.
+// The adjoint of covariance.h: from the gradient with respect to the covariance in the image to the gradients with
+// respect to scale and rotation, or to a 3D covariance, which it writes, and to the camera's Jacobian. project.h calls
+// it.
 #pragma once
 
 #include "core/blur.h"
 
 namespace ar {
 
-/// Writes a gradient, or adds it.
 template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
   if constexpr (Out::kAdd) {
     to = to + gradient;
@@ -15,13 +15,12 @@ template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
   }
 }
 
-/// The gradient with respect to Sigma = A R S^2 R^T A^T, taken to the columns t_k of A R: H_kl = t_k . dL/dSigma t_l
-/// and dL/dSigma t_k. With these every factor's gradient is a product (docs/numerics.md, "Gradient in the turned
-/// frame").
+/// The gradient with respect to Sigma = A R S^2 R^T A^T in the coordinates of the columns t_k of A R: H_kl = t_k .
+/// dL/dSigma t_l, and dL/dSigma t_k (docs/numerics.md, "Gradient in the turned frame").
 template <typename T> struct TurnedGrad {
   Vec3<T> diagonal, off;       ///< H_kk; H_12, H_20, H_01
   Vec3<T> x, y;                ///< dL/dSigma t_k, as two rows
-  Vec3<T> scaled_x, scaled_y;  ///< another part of x and y, already times s_k
+  Vec3<T> scaled_x, scaled_y;  ///< another part of x and y, times s_k
 };
 
 /// A covariance M = Sigma + c c^T + v I in the coordinates t_k.
@@ -55,8 +54,7 @@ AR_HD void add_log_amp_vjp(const Factors<T>& f, const TurnedCov<T>& m, T weight,
   h.y += (l * inv) * ((m.cov.xx + v) * cy - m.cov.xy * cx);
 }
 
-/// Every product is taken in coordinates, whitened or of the factors, where its terms do not cancel: errors grow
-/// neither with the length of a needle outside the image nor with the size of a splat.
+/// Every product is formed in coordinates, whitened or of the factors, in which its terms do not cancel.
 template <class B, typename T>
 AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, const BlurContext<B, T>& context) {
   constexpr bool kBlurred = !std::is_same_v<B, NoBlur>;
@@ -64,7 +62,6 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const Mat2<T>& w = grad.w;
   const Sym2<T>& g = grad.dL_dwhite;
   TurnedGrad<T> h = {zero, zero, zero, zero, zero, zero};
-  // adj(Sigma) t_k is a sum of two terms: across a needle's long axis t_k it is as small as the needle is thin.
   const Vec3<T> square = mul(f.scale, f.scale), n = cross(tx, ty);
   TurnedCov<T> m = {f.cov, cross(mul(square, ty), n), cross(n, mul(square, tx)), zero, T(0)};
   if constexpr (kBlurred) {
@@ -86,8 +83,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.frame == GradFrame::kTriangular) {
-    // The second row of w takes from one row of V its projection on the other: (adj(M) + v) t over the variance of the
-    // axis that comes first.
+    // The second row of w subtracts from one row of V its projection on the other: (adj(M) + v) t over a variance.
     const bool x_first = w.xx != T(0);
     const T along = w.xx + w.xy, across = (x_first ? w.yy : w.yx) * along * along;
     qx = along * (x_first ? tx : ty);
@@ -99,8 +95,8 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
   h.diagonal += mul(qx, ex) + mul(qy, ey);
   if (grad.frame == GradFrame::kAxes) {
-    // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. A window that holds all of a thin needle's width
-    // gives much of it, g.yy, which no turn changes: products of w would leave eps (s1/s2)^2 of it.
+    // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. Of a thin needle within a window its factor g.yy is large,
+    // and does not change with a turn: products of w would leave eps (s1/s2)^2 of it.
     const T c = m.cov.det > T(0) ? quotient(g.yy, m.cov.det) : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
     h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));
@@ -123,7 +119,6 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   return h;
 }
 
-/// Writes the gradients of scale and rotation, or of cov3d, and returns that of the Jacobian.
 template <class B, typename T, class Out>
 AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Out& out, int64_t i, const Factors<T>& f,
                                              const SplatGrad<T>& grad, const BlurContext<B, T>& context) {
@@ -156,7 +151,7 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Out& o
   const Vec3<T> by_scale = T(2) * mul(s, h.diagonal);
   if (out.scales) put(out, out.scales[i], g.scale_modifier * by_scale);
   if (out.rotations) {
-    // A turn about an axis mixes the other two, as far as they differ.
+    // A turn about one axis mixes the other two by their difference.
     const Vec3<T> gap = {(s.y - s.z) * (s.y + s.z), (s.z - s.x) * (s.z + s.x), (s.x - s.y) * (s.x + s.y)};
     put(out, out.rotations[i], rotation_vjp(f.quaternion, T(2) * mul(gap, h.off)));
   }

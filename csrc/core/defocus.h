@@ -1,30 +1,29 @@
-// Defocus. Through a thin lens of aperture a, a point at depth z appears as a disc of diameter f a |1/focus - 1/z|
-// [px]; under an orthographic camera of diameter f a |z - focus|. A disc of diameter D has the variance D^2 / 16 along
-// every axis (docs/numerics.md, "Lens and shutter").
+// Defocus, for blur_of() in camera.h. A point becomes a disc of diameter D, which the camera's model gives. The
+// variance of the disc is D^2 / 16 along every axis (docs/numerics.md, "Lens and shutter").
 #pragma once
 
-#include "core/lens.h"
+#include "core/camera/models.h"
 
 namespace ar {
 
-/// dD / (f a), signed.
-template <typename T> AR_HD T defocus_of(const Lens<T>& lens, T z) {
-  return lens.orthographic() ? z - lens.focus : T(1) / lens.focus - T(1) / z;
+/// D / (f aperture), signed.
+template <typename T> AR_HD T defocus_of(const FullCamera<T>& camera, Vec3<T> p) {
+  return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.defocus(camera.lens, p); });
 }
 
-template <typename T> AR_HD T defocus_variance(const Lens<T>& lens, Vec2<T> focal, T z) {
-  const T q = lens.aperture * defocus_of(lens, z);
-  return T(1.0 / 16) * focal.x * focal.y * q * q;
+template <typename T> AR_HD T defocus_variance(const FullCamera<T>& camera, Vec3<T> p) {
+  const T q = camera.lens.aperture * defocus_of(camera, p);
+  return T(1.0 / 16) * camera.focal.x * camera.focal.y * q * q;
 }
 
 template <typename T>
-AR_HD void defocus_variance_vjp(const Lens<T>& lens, Vec2<T> focal, T z, T dL_dvariance, T& dL_dz, Lens<T>& dL_dlens,
-                                Vec2<T>& dL_dfocal) {
-  const T q = defocus_of(lens, z), a = lens.aperture, g = T(1.0 / 16) * dL_dvariance;
+AR_HD void defocus_variance_vjp(const FullCamera<T>& camera, Vec3<T> p, T dL_dvariance, Vec3<T>& dL_dp,
+                                Lens<T>& dL_dlens, Vec2<T>& dL_dfocal) {
+  const Vec2<T> focal = camera.focal;
+  const T q = defocus_of(camera, p), a = camera.lens.aperture, g = T(1.0 / 16) * dL_dvariance;
   const T by_q = T(2) * g * focal.x * focal.y * a * a * q;
   dL_dlens.aperture += T(2) * g * focal.x * focal.y * a * q * q;
-  dL_dlens.focus -= lens.orthographic() ? by_q : by_q / (lens.focus * lens.focus);
-  dL_dz += lens.orthographic() ? by_q : by_q / (z * z);
+  visit_model(camera, [&](auto model) AR_HD_LAMBDA { model.defocus_vjp(camera.lens, p, by_q, dL_dp, dL_dlens); });
   dL_dfocal.x += g * focal.y * a * a * q * q;
   dL_dfocal.y += g * focal.x * a * a * q * q;
 }

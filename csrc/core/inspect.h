@@ -1,4 +1,5 @@
-// Statistics of a pixel: how much it shows of every splat, which splat it shows most of, and its median splat.
+// Statistics of a pixel: how much it shows of every splat, the splat it shows most of, and its median splat. The loops
+// of `inspect` (cpu/inspect.h, cuda/inspect.cuh) add them up into InspectParams.
 #pragma once
 
 #include "core/blend.h"
@@ -6,23 +7,20 @@
 
 namespace ar {
 
-/// A weight in units of kWeightUnit.
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
-/// What a pixel shows of a splat.
 template <typename T> struct Shown {
   T weight;       ///< the mean over the samples of transmittance times alpha
-  bool in_front;  ///< it shows something of the splat, and more than half of the light is left behind it
+  bool in_front;  ///< weight > 0, and more than half of the light is left after the splat
 };
 
-/// Composites the splats of a pixel front to back, and remembers two of them.
 template <typename T, class P> struct PixelSummary {
   static constexpr int S = P::kSamples;
   T transmittance[S];
   SampleState<T, P::kMoves> states[S] = {};
   T largest = T(0);
-  int32_t dominant = -1;  ///< the splat of the largest weight, of equal ones the nearest
-  int32_t median = -1;    ///< the first behind which less than half of the light is left
+  int32_t dominant = -1;  ///< the splat of the largest weight, the nearest if several have it
+  int32_t median = -1;    ///< the first splat after which less than half of the light is left
 
   AR_HD void start(bool inside) {
     for (int s = 0; s < S; ++s) transmittance[s] = inside ? T(1) : T(-1);
@@ -33,7 +31,6 @@ template <typename T, class P> struct PixelSummary {
     return any;
   }
 
-  /// Composites splat `id`.
   AR_HD Shown<T> add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
     T weight = T(0), through = T(0);
     AR_UNROLL

@@ -1,7 +1,6 @@
-// The functions that a value type V must support to run through the per-pixel formulas. Here for the
-// scalars float and double; cpu/pack.h adds packs of floats. A formula written with these names and
-// the arithmetic operators serves a CUDA thread (V = float), pixels on a CPU (V = Pack) and a test (V =
-// double). `ScalarOf<V>` is the element type, `V::Mask` or bool the result of comparisons.
+// The functions that formulas may call on a value type V. Here they are for float and double; cpu/pack.h has them for
+// packs of floats. So one formula serves a CUDA thread (V = float), several pixels of the CPU (V = Pack) and a test (V
+// = double). ScalarOf<V> is the type of an element, MaskOf<V> that of a comparison.
 #pragma once
 
 #include <cfloat>
@@ -41,7 +40,7 @@ AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
-/// One instruction where there is one that keeps NaN.
+/// One instruction on devices that have one for which NaN stays NaN.
 AR_HD float min(float a, float b) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   float y;
@@ -61,8 +60,8 @@ AR_HD float max(float a, float b) {
 #endif
 }
 
-/// a * b + c. Written out where the hot loops need one rounding less and one instruction less: the
-/// build turns contraction off, so that forward and backward round alike.
+/// a * b + c, contracted where there is such an instruction. Elsewhere the build turns contraction off, so that forward
+/// and backward passes round alike.
 AR_HD float madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)
   return std::fma(a, b, c);
@@ -78,7 +77,7 @@ AR_HD double madd(double a, double b, double c) {
 #endif
 }
 
-/// madd, held within [0, 1]. On a device one instruction, for which NaN is 0.
+/// madd, clamped to [0, 1]. On a device NaN becomes 0.
 AR_HD float saturated_madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__)
   float y;
@@ -90,7 +89,7 @@ AR_HD float saturated_madd(float a, float b, float c) {
 }
 AR_HD double saturated_madd(double a, double b, double c) { return min(max(madd(a, b, c), 0.0), 1.0); }
 
-/// Whether x is in [0, 1]. On a device one comparison: above 1 are the bits of all other numbers, -0 included.
+/// On a device one comparison: the bits of numbers outside of [0, 1], and of -0, are larger integers.
 AR_HD bool in_unit_interval(float x) {
 #if defined(__CUDA_ARCH__)
   return __float_as_uint(x) <= __float_as_uint(1.0f);
@@ -117,13 +116,13 @@ AR_HD float exp2(float x) {
 #endif
 }
 AR_HD double exp2(double x) { return std::exp2(x); }
-/// Complement of the error function, relative to itself within 4 ulp while it is a normal number.
+/// Within 4 ulp while the result is a normal number.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-// A root and a quotient as the compiler's own are, but on a device without the branch that those take for numbers near
-// the ends of the range of floats. It would take instructions, and around it none can be moved.
+// On a device sqrt and quotient lack the branch of the compiler's own, for numbers near the ends of the range of
+// floats: around a branch no instruction can be moved.
 
-/// The root, rounded correctly where x is not below 2^-100.
+/// Rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {
 #if defined(__CUDA_ARCH__)
   float inverse;
@@ -146,19 +145,18 @@ AR_HD float quotient(float a, float b) {
   float q = a * inverse;
   q = __fmaf_rn(__fmaf_rn(-b, q, a), inverse, q);
   q = __fmaf_rn(__fmaf_rn(-b, q, a), inverse, q);
-  return q == q ? q : a * approximate;  // NaN here: infinite or zero, or really NaN
+  return q == q ? q : a * approximate;  // of NaN: infinite, zero, or NaN
 #else
   return a / b;
 #endif
 }
 AR_HD double quotient(double a, double b) { return a / b; }
 
-/// A power of two that takes |x| to [1, 2) where x is a normal number but for the largest, and otherwise as near as it
-/// can.
+/// The power of two whose product with |x| is in [1, 2), or the nearest one for the tiniest and largest x.
 template <typename T> AR_HD T inverse_power_of_two(T x) {
   using Bits = std::conditional_t<sizeof(T) == sizeof(uint32_t), uint32_t, uint64_t>;
   static_assert(std::numeric_limits<T>::is_iec559 && sizeof(T) == sizeof(Bits));
-  // Of the field of the exponent: its lowest bit, and its highest value of a number, whose power of two has the lowest.
+  // Of the field of the exponent: its lowest bit, and its highest value of a finite number.
   constexpr Bits lowest = Bits(1) << (std::numeric_limits<T>::digits - 1);
   constexpr Bits field = (~Bits(0) >> 1) & ~(lowest - 1), highest = field - lowest;
   Bits bits;
@@ -169,7 +167,7 @@ template <typename T> AR_HD T inverse_power_of_two(T x) {
   return x;
 }
 
-/// a / b, quicker than quotient(). On a device within 2 ulp, for |b| in [2^-126, 2^126]; elsewhere exact.
+/// a / b, on a device quicker than quotient() and within 2 ulp, for |b| in [2^-126, 2^126].
 AR_HD float divide(float a, float b) {
 #if defined(__CUDA_ARCH__)
   float reciprocal;
@@ -181,7 +179,7 @@ AR_HD float divide(float a, float b) {
 }
 AR_HD double divide(double a, double b) { return a / b; }
 
-/// Square root, on a device within 1 ulp, and zero below 2^-126; elsewhere exact.
+/// On a device within 1 ulp, and zero below 2^-126.
 AR_HD float approx_sqrt(float x) {
 #if defined(__CUDA_ARCH__)
   float y;
@@ -193,21 +191,18 @@ AR_HD float approx_sqrt(float x) {
 }
 AR_HD double approx_sqrt(double x) { return std::sqrt(x); }
 
-/// a b - c d with one rounding of each product recovered: within 1.5 ulp of the exact difference
-/// where nothing under- or overflows (Kahan). For determinants of nearly singular matrices.
+/// a b - c d within 1.5 ulp, where nothing under- or overflows (Kahan), for determinants of nearly singular matrices.
 template <typename T> AR_HD T difference_of_products(T a, T b, T c, T d) {
   const T cd = c * d;
   return std::fma(a, b, -cd) + std::fma(-c, d, cd);
 }
 
-/// alpha / (1 - alpha).
 template <class V> AR_HD V odds(V alpha) { return divide(alpha, V(ScalarOf<V>(1)) - alpha); }
 
 /// False for NaN.
 template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(bound); }
 
-/// (1 - exp(-x)) / x on [0, 1/2]. Float: the minimax polynomial of degree 4, relative error 8e-8.
-/// Double: the Taylor series, relative error 5e-17.
+/// (1 - exp(-x)) / x on [0, 1/2], with a relative error of 8e-8 in float and 5e-17 in double.
 template <class V> AR_HD V one_minus_exp_ratio(V x) {
   using T = ScalarOf<V>;
   constexpr double kMinimax[] = {0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354,
@@ -241,7 +236,7 @@ template <class V> AR_HD V one_minus_exp_ratio(V x) {
   }
 }
 
-/// (1 - exp(-x)) for x >= 0, given e = exp(-x): the difference where it is well conditioned.
+/// 1 - exp(-x) for x >= 0, given e = exp(-x), without cancellation.
 template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
   return select(x < V(T(0.5)), x * one_minus_exp_ratio(x), V(T(1)) - e);

@@ -1,41 +1,37 @@
-// Motion blur. What moves by u px in the image while the shutter is open becomes a streak: a segment of length |u|,
-// which has the variance |u|^2 / 12 along u. In camera space a point p moves by w = -shift - turn x p, shift and turn
-// being those of the camera (docs/numerics.md, "Lens and shutter").
+// Motion blur, for blur_of() in camera.h. A point that moves by u px during the exposure becomes a segment of length
+// |u|, whose variance along u is |u|^2 / 12. In camera space the point p moves by w = -shift - turn x p (of the
+// camera); the camera's model gives u (docs/numerics.md, "Lens and shutter").
 #pragma once
 
-#include "core/lens.h"
+#include "core/camera/models.h"
 
 namespace ar {
 
 inline constexpr double kStreak = 0.28867513459481288225;  // 1 / sqrt(12)
 
-template <typename T> AR_HD Vec2<T> motion_streak(const Lens<T>& lens, Vec2<T> focal, Vec3<T> p) {
-  const Vec3<T> w = T(-1) * (lens.shift + cross(lens.turn, p));
-  if (lens.orthographic())
-    return {T(kStreak) * (focal.x * w.x + lens.screen.x), T(kStreak) * (focal.y * w.y + lens.screen.y)};
-  return {T(kStreak) * (focal.x / p.z * (w.x - p.x / p.z * w.z) + lens.screen.x),
-          T(kStreak) * (focal.y / p.z * (w.y - p.y / p.z * w.z) + lens.screen.y)};
+template <typename T> AR_HD Vec3<T> motion_of(const Lens<T>& lens, Vec3<T> p) {
+  return T(-1) * (lens.shift + cross(lens.turn, p));
+}
+
+template <typename T> AR_HD Vec2<T> motion_streak(const FullCamera<T>& camera, Vec3<T> p) {
+  const Lens<T>& lens = camera.lens;
+  const Vec2<T> v =
+      visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.velocity(camera, p, motion_of(lens, p)); });
+  return {T(kStreak) * (v.x + lens.screen.x), T(kStreak) * (v.y + lens.screen.y)};
 }
 
 template <typename T>
-AR_HD void motion_streak_vjp(const Lens<T>& lens, Vec2<T> focal, Vec3<T> p, Vec2<T> dL_dstreak, Vec3<T>& dL_dp,
+AR_HD void motion_streak_vjp(const FullCamera<T>& camera, Vec3<T> p, Vec2<T> dL_dstreak, Vec3<T>& dL_dp,
                              Lens<T>& dL_dlens, Vec2<T>& dL_dfocal) {
-  const Vec3<T> w = T(-1) * (lens.shift + cross(lens.turn, p));
   const Vec2<T> g = {T(kStreak) * dL_dstreak.x, T(kStreak) * dL_dstreak.y};
   dL_dlens.screen = dL_dlens.screen + g;
-  const T iz = lens.orthographic() ? T(1) : T(1) / p.z, gx = g.x * focal.x * iz, gy = g.y * focal.y * iz;
-  const T rx = lens.orthographic() ? T(0) : p.x * iz, ry = lens.orthographic() ? T(0) : p.y * iz;
-  const Vec3<T> by_w = {gx, gy, -(gx * rx + gy * ry)};
-  const T ux = w.x - rx * w.z, uy = w.y - ry * w.z;
-  dL_dfocal.x += g.x * iz * ux;
-  dL_dfocal.y += g.y * iz * uy;
-  dL_dlens.shift += T(-1) * by_w;
-  dL_dlens.turn += cross(by_w, p);  // w = p x turn - shift
-  dL_dp += cross(lens.turn, by_w);
-  if (lens.orthographic()) return;
-  dL_dp.x -= gx * w.z * iz;
-  dL_dp.y -= gy * w.z * iz;
-  dL_dp.z -= iz * (gx * ux + gy * uy) - iz * w.z * (gx * rx + gy * ry);
+  const VelocityGrad<T> by = visit_model(camera, [&](auto model) AR_HD_LAMBDA {
+    return model.velocity_vjp(camera, p, motion_of(camera.lens, p), g, dL_dlens, dL_dfocal);
+  });
+  dL_dlens.shift += T(-1) * by.w;
+  dL_dlens.turn += cross(by.w, p);  // w = p x turn - shift
+  dL_dp += cross(camera.lens.turn, by.w);
+  dL_dp += by.p;
 }
 
 }  // namespace ar

@@ -1,18 +1,17 @@
-// What differs between the compilers and devices that the core is built for.
+// Differences of the compilers and devices that the core is built for.
 #pragma once
 
 #if defined(__CUDACC__)
 #define AR_HD __host__ __device__ __forceinline__
 #define AR_HD_LAMBDA
 #else
-// Always inlined, so that a translation unit compiled for a newer instruction set never leaves a
-// copy of a core function behind for the linker to hand to one compiled for an older set.
+// Always inlined: otherwise the linker might give a copy compiled for a newer instruction set to code for an older one.
 #define AR_HD inline __attribute__((always_inline))
 /// The same for a lambda, between its parameters and its body.
 #define AR_HD_LAMBDA __attribute__((always_inline))
 #endif
 
-/// Before a loop of few, constant iterations, whose body should see the index as a constant.
+/// Before a loop whose body should see the index as a constant.
 #if defined(__CUDA_ARCH__)
 #define AR_UNROLL _Pragma("unroll")
 #elif defined(__CUDACC__)

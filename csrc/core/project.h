@@ -1,5 +1,6 @@
-// One Gaussian to one splat, and the adjoint. The camera gives its mean, covariance, opacity and depth in the image
-// (project_gaussian), the footprint its shape and support (shape_splat), the harmonics its colour (splat_color).
+// One Gaussian to one splat, and the adjoint: a library for cpu/project.h, cpu/rows.h and cuda/project*.cuh. The camera
+// gives mean, covariance, opacity and depth in the image (project_gaussian), the footprint shape and support
+// (shape_splat), the harmonics the colour (splat_color). project_vjp is the adjoint of all three.
 #pragma once
 
 #include <type_traits>
@@ -10,10 +11,10 @@
 
 namespace ar {
 
-/// The most that a footprint adds to how far a Gaussian reaches in the image (docs/numerics.md, "Culling bound").
+/// How far a Gaussian reaches in the image with a footprint, at most (docs/numerics.md, "Culling bound").
 template <typename T> struct CullBounds {
-  T variance;  ///< to its covariance [px^2]
-  T level;     ///< level of the support ellipse of an opacity of 1
+  T variance;  ///< that the footprint adds [px^2]
+  T level;     ///< of the support ellipse of an opacity of 1
 };
 
 template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
@@ -27,19 +28,18 @@ template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
   return bounds;
 }
 
-/// No smaller than the largest standard deviation of Gaussian i.
+/// An upper bound of the standard deviations of Gaussian i.
 template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   if (g.cov3ds) return sqrt(g.cov3ds[i].xx + g.cov3ds[i].yy + g.cov3ds[i].zz);
   const Vec3<T> s = g.scales[i];
   return g.scale_modifier * max(abs(s.x), max(abs(s.y), abs(s.z)));
 }
 
-/// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap, and never false for
-/// one that project() keeps. `p` becomes the projected mean.
+/// A cheap test, true for every Gaussian that project() keeps. Writes the projected mean.
 template <class Cam, typename T>
 AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds,
                           ProjectedMean<T>& p) {
-  const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first: they wait together
+  const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first, to wait once
   p = project_mean(camera, g.means[i]);
   if (!p.valid) return false;
   T variance = bounds.variance;
@@ -47,7 +47,7 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
     const Blur<T> blur = blur_of(camera, p.view);
     variance += blur.streak.x * blur.streak.x + blur.streak.y * blur.streak.y + blur.variance;
   }
-  const T stretch = largest_stretch(camera, p.view.z);
+  const T stretch = largest_stretch(camera, p.view);
   const T sigma = approx_sqrt(largest_zoom2(camera) * stretch * stretch * largest * largest + variance);
   const T level = bounds.level + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + T(kReachMargin) * sigma * approx_sqrt(level);
@@ -61,36 +61,34 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
   return may_be_visible(camera, g, i, bounds, mean);
 }
 
-/// A Gaussian in the image, whatever the footprint.
 template <typename T> struct ProjectedGaussian {
   Vec2<T> mean;  ///< px
   Cov2d<T> cov;
   T opacity;  ///< with the amplitude of a camera's blur
-  T depth;    ///< camera-space z
+  T depth;
 };
 
-/// False where there is nothing to draw: the covariance is none, or numbers are beyond what floats hold.
+/// False if the matrix is no covariance, or if numbers derived from it would overflow a float.
 template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
   const Cov2d<T>& cov = p.cov;
   return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// Row i of rows of the caller's. False if project_gaussian would have culled such a Gaussian, or if its depth has no
-/// place in the order of depths.
+/// Reads row i, with any numbers of the caller's. False if project_gaussian would have culled such a Gaussian, or if
+/// its depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   out = {rows.means2d[i], {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
-/// The same of a row in one piece.
 template <typename T> AR_HD bool read_row(const PackedRow<T>& row, ProjectedGaussian<T>& out) {
   out = {row.mean, {row.cov.xx, row.cov.xy, row.cov.yy, row.det}, row.opacity, row.depth};
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
-/// False if Gaussian i, whose projected mean is `mean`, is culled: behind the near plane, not finite, or degenerate.
+/// False if Gaussian i is culled: outside of what the camera shows, not finite, or degenerate.
 template <class Cam, typename T>
 AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, const ProjectedMean<T>& mean,
                             ProjectedGaussian<T>& out) {
@@ -100,22 +98,21 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
       !(within(factors.scale.x, kMaxScale) && within(factors.scale.y, kMaxScale) && within(factors.scale.z, kMaxScale)))
     return false;
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
-  out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], mean.view.z};
-  // The opacity before the blur: a large blur must not bring back what is degenerate.
+  out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], depth_at(camera, mean.view)};
+  // The opacity before the blur: a large blur must not make a degenerate Gaussian valid.
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
-/// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px], which takes a round splat for a little larger
-/// than it is.
+/// The radius that 3DGS reports [px]: ceil(3 sigma) along the major axis, a little too large for a round splat.
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
   const T half_gap = max(T(0.5) * eigenvalue_gap(cov), sqrt(T(kRadiusMinGap)));
   const T largest = T(0.5) * (cov.xx + cov.yy) + half_gap + variance;
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
-/// Gives a splat its shape, all but its colour. Returns 3DGS's radius, 0 if it is culled: off the image, or of a shape
-/// that no float holds. A splat that is kept may still touch no tile (level <= 0). `support`, if not null, is that of
-/// the splat where splat.level > 0.
+/// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 for a splat that
+/// is culled: outside of the image, or with a shape that overflows. A splat with a radius may touch no tile (level <=
+/// 0).
 template <typename T>
 AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
                       Support<T>* support = nullptr) {
@@ -147,7 +144,7 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   return touches || on_image ? radius : 0;
 }
 
-/// Colour of Gaussian i, whose coefficients are `sh`; black where it has neither. False if it is not finite.
+/// The colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
 template <class Cam, typename T>
 AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
   if (g.colors) {
@@ -164,8 +161,7 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   return finite;
 }
 
-/// Writes the place of Gaussian i in packed rows, where it has one. `radius` is 0 if its colour is not finite; then the
-/// row touches no pixel.
+/// Writes the packed row of Gaussian i, if there is room. With radius 0 the row touches no pixel.
 template <typename T>
 AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
   const int64_t place = *to.first + to.ends[i] - 1;
@@ -178,8 +174,8 @@ AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGauss
   to.ids[place] = int32_t(i);
 }
 
-/// Writes the gradient of the colour's parameters and returns the gradient with respect to the vector from the camera
-/// to the mean. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
+/// Writes the gradient of the colour's parameters, and returns the gradient with respect to the model's ray. `dL_dsh`,
+/// the gradient of the coefficients `sh`, may be null or the same memory as `sh`.
 template <class Cam, typename T, class Out>
 AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* sh,
                               Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
@@ -207,7 +203,6 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   return d.inv_length * (dL_dunit - dot(dL_dunit, d.unit) * d.unit);
 }
 
-/// Projects Gaussian i, all but its colour. Returns 3DGS's radius, 0 if it is culled. `support` as for shape_splat.
 template <class Cam, typename T>
 AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, const ProjectedMean<T>& mean,
                         FootprintChoice footprint, SplatRow<T>& splat, T& depth, Support<T>* support = nullptr) {
@@ -218,7 +213,7 @@ AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, con
   return shape_splat(p, footprint, camera.grid, splat, support);
 }
 
-/// Projects Gaussian i. Culls it too where its colour is not finite.
+/// Writes a splat with its colour. Culls Gaussian i also if the colour is not finite.
 template <class Cam, typename T>
 AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintChoice footprint, SplatRow<T>& splat,
                   T& depth) {
@@ -229,17 +224,16 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
   return 0;
 }
 
-/// Whether the channels of the caller's take the place of colours; else they are features beside them.
+/// Whether the caller's channels replace the colours; otherwise they are features beside colours.
 template <typename T> AR_HD bool given_colors(const ProjectParams<T>& p) {
   return p.given.data && !(p.channels.data && p.channels.color >= 0);
 }
 
-/// The first three of a row of channels, those that are missing black: what `adaptive` takes as a splat's colour.
+/// The first three channels of a row, filled up with zeros.
 template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
   return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};
 }
 
-/// Writes the channels of Gaussian i that project() makes: its colour, and its depth.
 template <typename T> AR_HD void write_channels(const ChannelRows<T>& rows, int64_t i, Vec3<T> color, T depth) {
   T* row = rows.data + i * rows.stride;
   if (rows.color >= 0) row[rows.color] = color.x, row[rows.color + 1] = color.y, row[rows.color + 2] = color.z;
@@ -247,7 +241,6 @@ template <typename T> AR_HD void write_channels(const ChannelRows<T>& rows, int6
   if (rows.inverse_depth >= 0) row[rows.inverse_depth] = T(1) / depth;
 }
 
-/// The adjoint of write_channels: `shown` += what the gradient of row i gives.
 template <typename T>
 AR_HD void add_channels_vjp(const ChannelRows<const T>& rows, int64_t i, T depth, ShownGrad<T>& shown) {
   const T* row = rows.data + i * rows.stride;
@@ -256,13 +249,11 @@ AR_HD void add_channels_vjp(const ChannelRows<const T>& rows, int64_t i, T depth
   if (rows.inverse_depth >= 0) shown.depth -= row[rows.inverse_depth] / (depth * depth);
 }
 
-/// Gradient with respect to a splat, and with respect to the logarithm of its opacity.
 template <typename T> struct ProjectedGrad {
   SplatGrad<T> splat;
-  T weighted;
+  T weighted;  ///< with respect to the logarithm of the opacity
 };
 
-/// From the sums over the pairs of a splat.
 template <typename T>
 AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>& cov, const PairGrad<T>& sums) {
   ProjectedGrad<T> grad = {};
@@ -274,7 +265,6 @@ AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>&
   return grad;
 }
 
-/// Whether a number in row `row` is not zero.
 template <typename T> AR_HD bool has_gradient(const ProjectedRowGrads<T>& rows, int64_t row) {
   const Vec2<T> mean = rows.means2d[row];
   const Sym2<T> cov = rows.cov2d[row];
@@ -288,7 +278,6 @@ template <typename T> AR_HD bool has_gradient(const ProjectedRowGrads<T>& rows, 
   return found;
 }
 
-/// Writes the gradient with respect to packed row i.
 template <typename T>
 AR_HD void write_packed_grad(T* to, int width, Vec2<T> mean, Sym2<T> cov, T opacity, Vec3<T> color, Vec2<T> absolute) {
   to[kPackedMean] = mean.x, to[kPackedMean + 1] = mean.y;
@@ -298,16 +287,15 @@ AR_HD void write_packed_grad(T* to, int width, Vec2<T> mean, Sym2<T> cov, T opac
   if (width > kPackedAbsolute) to[kPackedAbsolute] = absolute.x, to[kPackedAbsolute + 1] = absolute.y;
 }
 
-/// From the gradient of row `row` of ProjectedRows. `opacity` is the row's.
 template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGrads<T>& rows, int64_t row, T opacity) {
   const Sym2<T> g = rows.cov2d[row];
   return {{rows.means2d[row], {T(1), T(0), T(0), T(1)}, {g.xx, T(0.5) * g.xy, g.yy}, T(0), T(0), GradFrame::kPixels},
           opacity * rows.opacities[row]};
 }
 
-/// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null. `grad_of` turns
-/// the covariance and the opacity in the image into a ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs
-/// is not touched.
+/// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null.
+/// grad_of(covariance, opacity) returns the ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs is not
+/// touched.
 template <class Cam, typename T, class GradOf, class Out>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, ShownGrad<T> shown,
                        const Vec3<T>* sh, Vec3<T>* dL_dsh, const Out& out, CameraGrad<T>* camera_grad = nullptr) {
@@ -317,12 +305,12 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   const ProjectedGrad<T> projected = grad_of(seen.cov, seen.amp * g.opacities[i]);
   const SplatGrad<T>& grad = projected.splat;
   JacobianGrad<T> dL_djacobian;
-  Vec3<T> dL_dview = {T(0), T(0), shown.depth};
+  Vec3<T> dL_dview = depth_vjp(camera, mean.view, shown.depth);
   bool has_blur = false;
   if constexpr (Cam::kFull) {
     const Blur<T> blur = blur_of(camera, mean.view);
     has_blur = blur.any();
-    // Without blur the gradient with respect to it is zero too: the covariance grows with its square.
+    // Without blur its gradient is zero: the covariance grows with the square of the blur.
     if (has_blur) {
       const BlurContext<Blur<T>, T> context = {blur, blurred(factors, g, i, blur), projected.weighted};
       dL_djacobian = project_covariance_vjp(g, out, i, factors, grad, context);
@@ -333,20 +321,13 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   dL_dview += jacobian_vjp(camera, factors.jacobian, mean.view, dL_djacobian);
   Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
   const Vec3<T> dL_ddirection = splat_color_vjp(camera, g, out, i, sh, dL_dsh, shown.color);
-  bool same_direction = false;  // for all means
   if constexpr (Cam::kFull) {
-    same_direction = camera.lens.orthographic();
     if (camera_grad) {
-      add_project_mean_vjp(camera, mean, g.means[i], grad.dL_dmean, dL_dview, *camera_grad);
-      add_jacobian_vjp(camera, factors.jacobian, mean.view, dL_djacobian, *camera_grad);
-      if (same_direction) {
-        add_xyz(camera_grad->view_z, dL_ddirection);
-      } else {
-        camera_grad->position += T(-1) * dL_ddirection;
-      }
+      add_camera_vjp(camera, g.means[i], mean, grad.dL_dmean, dL_dview, factors.jacobian, dL_djacobian, dL_ddirection,
+                     *camera_grad);
     }
   }
-  if (!same_direction) dL_dmean += dL_ddirection;
+  ray_vjp(camera, dL_ddirection, dL_dmean);
   if (out.means) put(out, out.means[i], dL_dmean);
   if (out.opacities) put(out, out.opacities[i], projected.weighted / g.opacities[i]);
   if (out.means2d) {
@@ -357,7 +338,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   }
 }
 
-/// Writes what density control looks at, `sums` over pixels, into the columns of means2d that are there for it.
+/// Writes the sums of density control into their columns of means2d.
 template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, int64_t i, Vec2<T> size, Vec2<T> sums) {
   if (!out.means2d || out.mean_sums == MeanSums::kNone) return;
   T* row = out.means2d + i * out.means2d_stride;
@@ -370,7 +351,7 @@ template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, in
   }
 }
 
-/// Zero gradient, for a Gaussian that touched no pixel. Coefficients go to `dL_dsh`, if not null.
+/// The gradient of a Gaussian that touched no pixel. `dL_dsh` may be null.
 template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};

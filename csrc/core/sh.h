@@ -1,12 +1,11 @@
-// View-dependent colour from real spherical harmonics, degree 0 to 4. kMax is the largest degree that the code can
-// use: what the fourth costs in registers and memory is only paid where it is 4.
+// Colour by direction from real spherical harmonics of degree 0 to 4, and the adjoint. project.h calls it. kMax is the
+// largest degree that the code can use, since the fourth costs registers and memory.
 #pragma once
 
 #include "core/vec.h"
 
 namespace ar {
 
-/// Coefficients of a colour of this degree.
 AR_HD constexpr int sh_count(int degree) { return (degree + 1) * (degree + 1); }
 
 inline constexpr int kMaxShDegree = 4;
@@ -49,7 +48,7 @@ template <int kMax, typename T> AR_HD void sh_basis(int degree, Vec3<T> d, T* ba
   }
 }
 
-/// Gradient with respect to d of sum_k weight[k] basis[k](d), d taken as three free coordinates.
+/// Gradient of sum_k weight[k] basis[k](d) with respect to three independent coordinates d.
 template <int kMax, typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T* weight) {
   Vec3<T> g = {T(0), T(0), T(0)};
   if (degree < 1) return g;
@@ -94,7 +93,7 @@ template <int kMax, typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d
   return g;
 }
 
-/// Colour before the clamp at zero: sum of coefficients times basis, plus 1/2.
+/// Colour before the clamp at zero.
 template <int kMax, typename T> AR_HD Vec3<T> sh_color(int degree, const T* basis, const Vec3<T>* coefficients) {
   constexpr int kCount = sh_count(kMax);
   Vec3<T> color = {T(0.5), T(0.5), T(0.5)};

@@ -1,6 +1,6 @@
-// The structural similarity of two images as the loss of 3D Gaussian Splatting has it [SSIM, Eq. 13]: a Gaussian window
-// of 11 x 11 pixels with a standard deviation of 1.5 px, zeros outside the images, images of values in [0, 1]. And the
-// loss itself, a combination of the similarity and the mean absolute error.
+// The loss of 3DGS, a combination of the structural similarity of two images [SSIM, Eq. 13] and their mean absolute
+// error; and its adjoint. The window is a Gaussian of 11 x 11 pixels with a standard deviation of 1.5 px; outside the
+// images, whose values are in [0, 1], are zeros. cpu/ssim.cpp and cuda/ssim.cu run over the pixels.
 //
 // [SSIM] Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity, 2004.
 #pragma once
@@ -9,16 +9,15 @@
 
 namespace ar {
 
-/// Pixels of the window on each side of its centre, and along an axis.
 inline constexpr int kSsimRadius = 5, kSsimWindow = 2 * kSsimRadius + 1;
 
-/// What keeps the quotients of the means and of the variances away from 0 / 0.
+/// They keep quotients from 0 / 0.
 inline constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
-/// The sum over the window along one axis, where at(k) is the value k pixels from its centre. The window is the product
-/// of its rows and its columns, and it is symmetric, so that this is also its adjoint.
+/// The sum over the window along one axis; at(k) is the value k pixels from its centre. The window is separable and
+/// symmetric, so that this is also the adjoint.
 template <typename T, class At> AR_HD T window_sum(const At& at) {
-  // exp(-k^2 / (2 * 1.5^2)), over the sum of all eleven.
+  // exp(-k^2 / (2 * 1.5^2)), normalised
   constexpr double kWeights[] = {0.26601172486179434341, 0.21300553771125369989, 0.10936068950970001069,
                                  0.03600077212843082365, 0.00759875813523918418, 0.00102838008447910988};
   T sum = T(kWeights[0]) * at(0);
@@ -27,11 +26,11 @@ template <typename T, class At> AR_HD T window_sum(const At& at) {
   return sum;
 }
 
-/// Window sums of image x and target y: of their values and of their products.
+/// Window sums of image x and target y.
 inline constexpr int kSsimMoments = 5;
 enum SsimMoment { kMomentX, kMomentY, kMomentXX, kMomentYY, kMomentXY };
 
-/// The similarity at a pixel, and its derivatives with respect to the window sums that the image is in.
+/// The similarity at a pixel, and its derivatives by window sums of the image.
 inline constexpr int kSsimPartials = 3;
 enum SsimPartial { kPartialX, kPartialXX, kPartialXY };
 template <typename T> struct Ssim {
@@ -52,7 +51,6 @@ template <typename T> AR_HD Ssim<T> ssim(const T (&moments)[kSsimMoments]) {
   return s;
 }
 
-/// The value of a pixel; of a photograph, which has 8 bits, its share of 255.
 template <typename T> AR_HD T pixel_value(T value) { return value; }
 template <typename T> AR_HD T pixel_value(uint8_t value) { return T(value) / T(255); }
 
@@ -61,28 +59,26 @@ template <typename T> struct LossWeights {
   T l1, ssim, constant;
 };
 
-/// Planes are images of one channel. Writes the map of similarities or the loss.
 template <typename T, typename Target> struct SsimParams {
   int64_t planes;
   int height, width;
   const T* image;        ///< [planes][height][width]
   const Target* target;  ///< [planes][height][width]
   LossWeights<T> weights;
-  T* map;       ///< [planes][height][width] or null
+  T* map;       ///< [planes][height][width] the similarities, or null
   T* loss;      ///< [1] or null
   T* partials;  ///< [kSsimPartials][planes][height][width] for the adjoint, or null
 
   AR_HD int64_t pixels() const { return planes * height * width; }
 };
 
-/// The loss from sums over all pixels.
 template <typename T, typename Target>
 AR_HD T combined_loss(const SsimParams<T, Target>& p, double l1_sum, double ssim_sum) {
   const double n = double(p.pixels());
   return T(double(p.weights.l1) * (l1_sum / n) + double(p.weights.ssim) * (ssim_sum / n) + double(p.weights.constant));
 }
 
-/// Of the map or of the loss, whichever gradient there is.
+/// Reads dL_dmap or dL_dloss, the one that is not null.
 template <typename T, typename Target> struct SsimVjpParams {
   int64_t planes;
   int height, width;
@@ -97,15 +93,15 @@ template <typename T, typename Target> struct SsimVjpParams {
   AR_HD int64_t pixels() const { return planes * height * width; }
 };
 
-/// What the gradients of the loss with respect to |x - y| and to the similarity are, the same in every pixel. The
-/// gradient of a map is in the partials that are summed already.
+/// The gradients with respect to |x - y| and to the similarity, equal in all pixels. The partials include that of a
+/// map.
 template <typename T, typename Target> AR_HD LossWeights<T> pixel_weights(const SsimVjpParams<T, Target>& p) {
   if (p.dL_dmap) return {T(0), T(1), T(0)};
   const T share = *p.dL_dloss / T(p.pixels());
   return {share * p.weights.l1, share * p.weights.ssim, T(0)};
 }
 
-/// The gradient with respect to pixel x of the image from the window sums of the partials around it.
+/// The gradient with respect to pixel x. `partials`: their window sums.
 template <typename T> AR_HD T ssim_vjp(T x, T y, const T (&partials)[kSsimPartials], LossWeights<T> weights) {
   const T similarity = partials[kPartialX] + T(2) * x * partials[kPartialXX] + y * partials[kPartialXY];
   const T d = x - y;

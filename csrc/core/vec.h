@@ -1,4 +1,5 @@
-// Small fixed-size vectors and matrices. Aggregates of scalars: no padding, no constructors.
+// Small vectors and matrices, for all of core. They are aggregates of scalars without padding, so that an array of them
+// is an array of numbers.
 #pragma once
 
 #include "core/lanes.h"
@@ -25,8 +26,8 @@ template <typename T> struct Lower2 {
   T xx, yx, yy;
 };
 
-/// Symmetric 2x2. As a gradient G it means dL = tr(G dSigma): xy is the matrix entry, so the derivative with respect to
-/// the one number that fills both off-diagonal entries is 2 xy.
+/// Symmetric 2x2. A gradient G means dL = tr(G dSigma): the derivative with respect to the number that fills both
+/// off-diagonal entries is 2 xy.
 template <typename T> struct Sym2 {
   T xx, xy, yy;
 };
@@ -61,7 +62,7 @@ template <typename T> AR_HD Vec3<T> mul(Vec3<T> a, Vec3<T> b) { return {a.x * b.
 /// (a_1 b_2, a_2 b_0, a_0 b_1).
 template <typename T> AR_HD Vec3<T> shifted_products(Vec3<T> a, Vec3<T> b) { return {a.y * b.z, a.z * b.x, a.x * b.y}; }
 
-/// v^T m: the combination of m's rows with the weights v.
+/// v^T m.
 template <typename T> AR_HD Vec3<T> combine_rows(Vec3<T> v, const Mat3<T>& m) {
   return v.x * m.row[0] + v.y * m.row[1] + v.z * m.row[2];
 }
@@ -77,7 +78,6 @@ template <typename T> AR_HD Mat2<T> operator*(T s, const Mat2<T>& m) {
   return {s * m.xx, s * m.xy, s * m.yx, s * m.yy};
 }
 template <typename T> AR_HD Lower2<T> operator*(T s, const Lower2<T>& m) { return {s * m.xx, s * m.yx, s * m.yy}; }
-/// All four entries.
 template <typename T> AR_HD Mat2<T> all_of(const Mat2<T>& m) { return m; }
 template <typename T> AR_HD Mat2<T> all_of(const Lower2<T>& m) { return {m.xx, T(0), m.yx, m.yy}; }
 /// m v with scalar m and lanes v.

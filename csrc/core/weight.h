@@ -1,11 +1,11 @@
-// The weight of one splat in one pixel, and its adjoint: footprint_weight, one element at a time.
+// The weight of one splat in one pixel, and its adjoint, for any footprint. cpu/weight.h and cuda/weight.cuh run them
+// over the elements of the operator footprint_weight.
 #pragma once
 
 #include "core/footprint/contract.h"
 
 namespace ar {
 
-/// Arguments of footprint_weight and its adjoint, elementwise.
 template <typename T> struct WeightParams {
   int64_t n;
   FootprintOptions options;
@@ -14,7 +14,7 @@ template <typename T> struct WeightParams {
   const T* dL_dweights;  ///< vjp only
   T* weights;            ///< forward only
   Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only; xy: derivative with respect to the one number that fills both places
+  Sym2<T>* dL_dcovs;     ///< vjp only; xy: with respect to the number that fills both entries
 };
 
 template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
@@ -32,7 +32,7 @@ template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintO
 
 template <typename T> struct WeightGrad {
   Vec2<T> offset;
-  Sym2<T> cov;  ///< xy: derivative with respect to the one number that fills both places
+  Sym2<T> cov;  ///< xy: with respect to the number that fills both entries
 };
 
 template <class F, typename T>

@@ -125,7 +125,7 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
         if (p.pair_colors) shown.color += *reinterpret_cast<const Vec3<T>*>(row + cpu::kPairNumbers);
         if (p.pair_means) mean_sums = mean_sums + p.pair_means[pair];
       }
-      if (p.dL_dchannels.data) add_channels_vjp(p.dL_dchannels, i, apply_row(camera.view_z, g.means[i]), shown);
+      if (p.dL_dchannels.data) add_channels_vjp(p.dL_dchannels, i, depth_of(camera, g.means[i]), shown);
       const auto grad_of = [&](const Cov2d<T>& cov, T) { return projected_grad(p.footprint, cov, sums); };
       ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
                       coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,

@@ -1,28 +1,16 @@
 #include "cpu/sort.h"
 
 #include <algorithm>
-#include <cstring>
 #include <memory>
 #include <numeric>
 #include <utility>
 #include <vector>
 
+#include "core/bin.h"
 #include "cpu/parallel.h"
 
 namespace ar::cpu {
 namespace {
-
-/// Unsigned integers in the order of positive floats.
-uint32_t depth_key(float depth) {
-  uint32_t key;
-  std::memcpy(&key, &depth, sizeof key);
-  return key;
-}
-uint64_t depth_key(double depth) {
-  uint64_t key;
-  std::memcpy(&key, &depth, sizeof key);
-  return key;
-}
 
 /// As many numbers as make it worthwhile that another thread adds them up, or sorts them, and kinds of items that are
 /// placed together.
@@ -77,7 +65,7 @@ int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, 
 
 /// LSD radix sort with a histogram per part: stable, so the result does not depend on their number.
 template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads, int32_t* order) {
-  using Key = decltype(depth_key(T()));
+  using Key = decltype(depth_bits(T()));
   constexpr int kBits = 11, kBuckets = 1 << kBits;
   struct Entry {
     Key key;
@@ -92,7 +80,7 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     Key common = ~Key(0), any = 0;
     const Part part = part_of(n, parts, p);
     for (int64_t i = part.begin; i < part.end; ++i) {
-      const Key key = depth_key(depths[i]);
+      const Key key = depth_bits(depths[i]);
       common &= key;
       any |= key;
       from[i] = {key, int32_t(i)};

@@ -5,7 +5,7 @@
 
 namespace ar::cpu {
 
-/// Sets order [n] to the indices of `depths` (all >= 0) in ascending order, ties in input order.
+/// Sets order [n] to the indices of `depths` (all >= 0, with -0 = 0) in ascending order, ties in input order.
 template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads, int32_t* order);
 
 /// Replaces each of n numbers by the sum of those before it, and returns the sum of all.

@@ -4,6 +4,7 @@
 // Arguments have been checked (checks.h). What is relied on here: tensors are contiguous and on one device; lists and
 // state fit each other, the splats and the image.
 #include <ATen/Dispatch.h>
+#include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>

@@ -138,6 +138,9 @@ std::vector<std::pair<std::string, int>> lens_members() {
   return members;
 }
 
+/// The names of the camera models, in the order of their numbers.
+template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
+
 /// Columns as Python indexes them: a number, or a slice of several.
 pybind11::object columns_at(int64_t first, int64_t count) {
   if (count == 1) return pybind11::int_(first);
@@ -216,6 +219,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();
+  m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("TILE") = ar::kTile;
   m.def(

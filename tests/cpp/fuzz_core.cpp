@@ -130,7 +130,7 @@ template <typename T> struct AnyScene {
 /// What occurs: effects from far below a pixel to far above an image, some in focus or at a plane to the bit.
 template <typename T> Lens<T> decode_lens(Bytes& in, const TestCamera<T>& camera, bool orthographic) {
   Lens<T> lens = plain_lens(camera.tan_x, camera.tan_y);
-  lens.parallel = T(orthographic);
+  lens.model = T(orthographic ? kCameraModel<Orthographic> : kCameraModel<Pinhole>);
   if (in.one_in(3)) lens.near = orthographic && in.one_in(2) ? T(0) : in.log_between<T>(1e-3, 3);
   if (in.one_in(3)) lens.far = lens.near + in.log_between<T>(1e-3, 30);
   if (in.one_in(2)) lens.center = {in.between<T>(-10, 10) * camera.tan_x, in.between<T>(-10, 10) * camera.tan_y};

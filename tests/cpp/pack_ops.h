@@ -38,7 +38,7 @@ const test::PackOps kPackOps = {
     },
     [](const float* splat, int width, int height, int64_t tile, bool* reached) {
       const TileView view(TileGrid{width, height}, tile);
-      const PackSet<float> packs = reach_of(splat_at<Point, float>(splat, 0, nullptr), view);
+      const PackSet<float> packs = reach_of(splat_at<Point>(splat, 0), view);
       for (int i = 0; i < kTilePixels; ++i) {
         const int pack = Packs<float>::place(i % kTile, i / kTile) / kLanes;
         reached[i] = packs.words[pack / PackSet<float>::kBits] >> pack % PackSet<float>::kBits & 1;

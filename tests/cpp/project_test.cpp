@@ -92,50 +92,11 @@ template <typename T> Sym3<T> cov3d_of(Vec4<T> rotation, Vec3<T> s) {
   return {at(0, 0), at(0, 1), at(0, 2), at(1, 1), at(1, 2), at(2, 2)};
 }
 
-template <typename T> TestCamera<T> test_camera() { return {64, 48, 0.5, {0.3, -0.4, 0.7}, {0.1, -0.2}}; }
-
-/// What a camera is loaded from.
-template <typename T> struct View {
-  TestCamera<T> test = test_camera<T>();
-  Lens<T> lens = plain_lens<T>(test.tan_x, test.tan_y);
-
-  template <class Cam> Cam load() const { return load_camera_as<Cam>(test.camera_view(lens)); }
-
-  /// What number k of CameraGrad is the derivative by.
-  T& number(int k) {
-    constexpr int kRows[] = {0, 1, 3};  // of a clip matrix
-    if (k < 12) return test.view[4 * (k % 4) + k / 4];
-    if (k < 24) return test.proj[4 * (k % 4) + kRows[k / 4 - 3]];
-    return k < 27 ? test.position[k - 24] : reinterpret_cast<T*>(&lens)[k - 27];
-  }
-};
 constexpr Field kCameraFields[] = {{"view_x", 0, 4},  {"view_y", 4, 4},    {"view_z", 8, 4},    {"clip_x", 12, 4},
                                    {"clip_y", 16, 4}, {"clip_w", 20, 4},   {"position", 24, 3}, {"tan", 27, 2},
                                    {"center", 29, 2}, {"aperture", 31, 1}, {"focus", 32, 1},    {"shift", 33, 3},
                                    {"turn", 36, 3},   {"screen", 39, 2}};
-constexpr int kFirstFixed = 41;  ///< near, far and parallel have no gradient
-
-enum Effect { kOffCenter = 1, kDefocus = 2, kShift = 4, kTurn = 8, kScreen = 16, kAllEffects = 31 };
-
-/// With these effects, as large as a splat or so. An orthographic camera sees 4 world units across.
-template <typename T> View<T> random_view(Random& random, int effects, bool orthographic) {
-  View<T> view;
-  if (orthographic) {
-    view.test = {64, 48, 2, {0.3, -0.4, 0.7}, {0.1, -0.2}, true};
-    view.lens = plain_lens<T>(view.test.tan_x, view.test.tan_y);
-    view.lens.parallel = T(1);
-  }
-  const auto normal = [&](double size) { return T(size * random.normal()); };
-  if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
-  if (effects & kDefocus) {
-    view.lens.aperture = T(random.log_uniform(0.01, 1));
-    view.lens.focus = T(random.uniform(1, 6));
-  }
-  if (effects & kShift) view.lens.shift = {normal(0.2), normal(0.2), normal(0.2)};
-  if (effects & kTurn) view.lens.turn = {normal(0.1), normal(0.1), normal(0.1)};
-  if (effects & kScreen) view.lens.screen = {normal(5), normal(5)};
-  return view;
-}
+constexpr int kFirstFixed = 41;  ///< near, far and model have no gradient
 
 /// Each effect alone, then none, then together.
 int effects_of(int trial) { return trial % 8 < 5 ? 1 << (trial % 8) : trial % 8 == 5 ? 0 : int(kAllEffects); }
@@ -238,9 +199,9 @@ template <class Cam> void expect_gradients_match_differences(const Footprint& f,
   Random random(1);
   int clamped = 0, blurred = 0, checked = 0;
   for (int trial = 0; checked < count; ++trial) {
-    const bool orthographic = Cam::kFull && random.below(3) == 0;
-    const View<double> at = Cam::kFull ? random_view<double>(random, effects_of(trial), orthographic) : View<double>();
-    const double z = random.uniform(1, 6), scale = orthographic ? 4 : z, size = scale * random.log_uniform(0.01, 0.5);
+    const int model = Cam::kFull ? random.below(kCameraModels) : 0;
+    const View<double> at = Cam::kFull ? random_view<double>(random, effects_of(trial), model) : View<double>();
+    const double z = random.uniform(1, 6), scale = at.scale(z), size = scale * random.log_uniform(0.01, 0.5);
     Parameters<double> p;
     p.mean = at.test.world(scale * random.uniform(-1, 1), scale * random.uniform(-0.8, 0.8), z);
     p.scale = {size * random.uniform(0.2, 1), size * random.uniform(0.2, 1), size * random.uniform(0.2, 1)};
@@ -270,6 +231,7 @@ template <class Cam> void expect_gradients_match_differences(const Footprint& f,
       continue;
     }
     ++checked;
+    const bool orthographic = model == kCameraModel<Orthographic>;
     clamped += !orthographic && (factors.jacobian.clamped_x || factors.jacobian.clamped_y);
     blurred += seen.wide > 1.1 * own.wide;
     for (int k = 0; k < 3; ++k) {
@@ -479,8 +441,8 @@ TEST_P(ProjectTest, CullsWhatIsNotFiniteOrBehind) {
   expect_culled_unless_finite<Camera<float>>(GetParam(), View<float>());
   expect_culled_unless_finite<Camera<double>>(GetParam(), View<double>());
   Random random(4);
-  for (const bool orthographic : {false, true}) {
-    View<float> at = random_view<float>(random, kAllEffects, orthographic);
+  for (int model = 0; model < kCameraModels; ++model) {
+    View<float> at = random_view<float>(random, kAllEffects, model);
     at.lens.near = 0.3f;
     at.lens.far = 5;
     expect_culled_unless_finite<FullCamera<float>>(GetParam(), at);
@@ -526,8 +488,7 @@ void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Funct
     if (trial % 2) by = {random.log_uniform(0.1, 10), random.log_uniform(0.1, 10), random.log_uniform(0.1, 10)};
     const View<float> stretched = of_stretched_world(at, by);
     const auto camera = stretched.template load<Cam>();
-    const double z = random.log_uniform(0.15, 100), scale = at.lens.orthographic() ? 4 : z,
-                 size = scale * random.log_uniform(1e-4, 3);
+    const double z = random.log_uniform(0.15, 100), scale = at.scale(z), size = scale * random.log_uniform(1e-4, 3);
     const auto length = [&] { return float(size * random.log_uniform(0.01, 1) * (random.below(2) ? 1 : -1)); };
     Parameters<float> p = {};
     p.mean = at.test.world(scale * random.uniform(-3, 3), scale * random.uniform(-3, 3), z);
@@ -550,7 +511,7 @@ TEST_P(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
                                                              [&](int) -> const View<float>& { return plain; });
   std::vector<View<float>> views;
   Random random(5);
-  for (int k = 0; k < 64; ++k) views.push_back(random_view<float>(random, effects_of(k), random.below(3) == 0));
+  for (int k = 0; k < 64; ++k) views.push_back(random_view<float>(random, effects_of(k), random.below(kCameraModels)));
   expect_nothing_kept_that_may_not_be_visible<FullCamera<float>>(
       GetParam(), [&](int trial) -> const View<float>& { return views[trial % views.size()]; });
 }

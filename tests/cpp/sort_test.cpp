@@ -55,6 +55,12 @@ TYPED_TEST(SortTest, NeighboursAndPowersOfTwo) {
   this->expect_stable_order(depths);
 }
 
+// Alone, where every key has the same digits but for the sign, and among others.
+TYPED_TEST(SortTest, ZerosOfBothSignsAreEqual) {
+  this->expect_stable_order({TypeParam(0), TypeParam(-0.0), TypeParam(0), TypeParam(-0.0)});
+  this->expect_stable_order({TypeParam(2), TypeParam(-0.0), TypeParam(1e-30), TypeParam(0), TypeParam(-0.0)});
+}
+
 TEST(SumBefore, OfEveryLength) {
   Random random(3);
   for (const int n : {0, 1, 5, 4096, 8191, 8192, 50001}) {

@@ -133,4 +133,46 @@ template <typename T> struct TestCamera {
   }
 };
 
+template <typename T> TestCamera<T> test_camera() { return {64, 48, 0.5, {0.3, -0.4, 0.7}, {0.1, -0.2}}; }
+
+/// What a camera is loaded from.
+template <typename T> struct View {
+  TestCamera<T> test = test_camera<T>();
+  Lens<T> lens = plain_lens<T>(test.tan_x, test.tan_y);
+
+  template <class Cam> Cam load() const { return load_camera_as<Cam>(test.camera_view(lens)); }
+
+  /// World units across what the camera sees at depth z, or so.
+  double scale(double z) const { return lens.model == kCameraModel<Orthographic> ? 4 : z; }
+
+  /// What number k of CameraGrad is the derivative by.
+  T& number(int k) {
+    constexpr int kRows[] = {0, 1, 3};  // of a clip matrix
+    if (k < 12) return test.view[4 * (k % 4) + k / 4];
+    if (k < 24) return test.proj[4 * (k % 4) + kRows[k / 4 - 3]];
+    return k < 27 ? test.position[k - 24] : reinterpret_cast<T*>(&lens)[k - 27];
+  }
+};
+enum Effect { kOffCenter = 1, kDefocus = 2, kShift = 4, kTurn = 8, kScreen = 16, kAllEffects = 31 };
+
+/// Through camera model number `model`, with these effects, as large as a splat or so.
+template <typename T> View<T> random_view(Random& random, int effects, int model) {
+  View<T> view;
+  if (model == kCameraModel<Orthographic>) {
+    view.test = {64, 48, 2, {0.3, -0.4, 0.7}, {0.1, -0.2}, true};
+    view.lens = plain_lens<T>(view.test.tan_x, view.test.tan_y);
+  }
+  view.lens.model = T(model);
+  const auto normal = [&](double size) { return T(size * random.normal()); };
+  if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
+  if (effects & kDefocus) {
+    view.lens.aperture = T(random.log_uniform(0.01, 1));
+    view.lens.focus = T(random.uniform(1, 6));
+  }
+  if (effects & kShift) view.lens.shift = {normal(0.2), normal(0.2), normal(0.2)};
+  if (effects & kTurn) view.lens.turn = {normal(0.1), normal(0.1), normal(0.1)};
+  if (effects & kScreen) view.lens.screen = {normal(5), normal(5)};
+  return view;
+}
+
 }  // namespace ar::test

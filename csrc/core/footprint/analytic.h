@@ -1,4 +1,4 @@
-// Analytic-Splatting: the Gaussian integrated over a unit pixel turned into its eigenframe, with a
+// The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
 // logistic approximation of the Gaussian's CDF [AS, Eq. 2-9].
 #pragma once
 
@@ -10,11 +10,10 @@ namespace ar {
 inline constexpr double kLogistic1 = 1.6;
 inline constexpr double kLogistic3 = 0.07;
 
-/// Standard deviations below this [px] are raised to it, where r^3 still fits a float. The weight
-/// of so thin a splat is below 2.6e-6, far under the threshold of 1/255.
+/// Lower bound of standard deviations [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
-/// Numbers of one axis of a splat's frame that all pixels share. Coordinates along the axis are t = u/sigma.
+/// Numbers of one axis of a splat's frame, for all pixels. Coordinates along the axis are t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
   T constant, square;  // f(b) - f(a) = constant + square t^2, see LogisticWindow
@@ -38,9 +37,9 @@ template <typename T> struct LogisticSlopes {
   }
 };
 
-/// One axis: F = S(t + half) - S(t - half), without the cancellation of the difference:
-/// F = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half. (The sinh form
-/// of docs/numerics.md, scaled to stay finite.)
+/// F = S(t + half) - S(t - half) along one axis, without cancellation:
+/// F = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half. It is the sinh form of
+/// docs/numerics.md, scaled to stay finite.
 template <class V> struct LogisticWindow {
   using T = ScalarOf<V>;
   V lower, upper;  // exp(f(a)), exp(-f(b))
@@ -71,17 +70,16 @@ template <class V> struct LogisticValue {
                       const LogisticSlopes<T>& slopes) {
     const V one = V(T(1)), distance = abs(t), tt = t * t;
     value = f.numerator * inverse;
-    // dF/dx and dF/dy of F = sinh y / (cosh x + cosh y), x and y the half sum and half difference of
-    // f(b) and f(a); both without cancellation.
+    // Derivatives of F = sinh y / (cosh x + cosh y), with x and y the half sum and half difference of f(b) and f(a).
     const V product = f.lower * f.upper;
     const V by_x = value * (f.upper - f.lower) * inverse;
     const V by_y = madd(V(T(4)), product, (f.lower + f.upper) * (one + product)) * inverse * inverse;
     const V dx = madd(V(T(3 * kLogistic3)), tt, V(slopes.linear)), dy = V(axis.square) * distance;
     const V by_distance = madd(by_x, dx, by_y * dy);
     by_t = select(t < V(T(0)), -by_distance, by_distance);
-    // F - y dF/dy is of the order of y^3: for wide splats, where all of d(sigma F)/dsigma is small, by its first
-    // term y F (F - y/3), whose error of y^5/90 is then below the rounding of the difference.
-    const V y = V(T(0.5)) * madd(V(axis.square) * t, t, V(axis.constant));  // as in the window: computed once
+    // F - y dF/dy, of the order of y^3, cancels for wide splats. There its first term y F (F - y/3), with an error of
+    // y^5/90, is better.
+    const V y = V(T(0.5)) * madd(V(axis.square) * t, t, V(axis.constant));  // as in the window
     const V excess = select(y < V(T(kSmall<T>)), y * value * madd(V(T(-1.0 / 3)), y, value), value - y * by_y);
     by_sigma = excess - madd(by_x, distance * (dx + V(slopes.spread)), by_y * madd(V(axis.square), tt, V(slopes.cube)));
   }
@@ -90,9 +88,8 @@ template <class V> struct LogisticValue {
   template <typename S> static constexpr double kSmall = sizeof(S) == 4 ? 0.04 : 3e-4;
 };
 
-/// Which derivative of the frame the adjoint takes.
 enum class FrameGradient {
-  kFrozen,  ///< the pixel's frame is held fixed: finite everywhere (docs/numerics.md, "Frame gradient")
+  kFrozen,  ///< of a fixed frame: finite everywhere (docs/numerics.md, "Frame gradient")
   kPaper,   ///< the derivative of the formula [AS, Eq. 10-16]: grows like 1/(l1 - l2)
 };
 
@@ -121,8 +118,8 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
   AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
-  /// Deviates: [AS, Eq. 2] takes eigenvectors that are 0/0 for a diagonal Sigma with S11 > S22, and
-  /// the smaller eigenvalue as a difference. Here the half angle and l2 = det / l1.
+  /// Deviates: in [AS, Eq. 2] eigenvectors are 0/0 for a diagonal Sigma with S11 > S22, and the smaller eigenvalue is a
+  /// difference.
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Eigenframe<T> frame = eigenframe(cov);
     const T s1 = max(frame.sigma.x, T(kMinSigma)), s2 = max(frame.sigma.y, T(kMinSigma));
@@ -134,9 +131,9 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }
 
-  /// Along one axis -2 ln(F(u)/F(0)) >= u^2/(sigma^2 + 1/12) - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12),
-  /// wherever F(u)/F(0) > 1/255 (checked numerically in the tests). The first term is the flat top
-  /// of a narrow Gaussian's window, the second the logistic's tail.
+  /// Along one axis -2 ln(F(u)/F(0)) >= u^2/(sigma^2 + 1/12) - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12), wherever
+  /// F(u)/F(0) > 1/255 (the tests check it). w^4/48 is for the flat top of a narrow Gaussian's window, 0.05 for the
+  /// logistic's tail.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Vec2<T> w = widened_by_pixel(g.inv_sigma);
     const T slack = (w.x * w.x * w.x * w.x + w.y * w.y * w.y * w.y) / T(48) + T(0.1);
@@ -157,8 +154,8 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return V(t.mass) * (f.numerator * g.numerator) * divide(V(T(1)), f.denominator * g.denominator);
   }
 
-  /// With I = mass F(u/s1) G(v/s2): offset = mass (F' G, F G'), shape = the derivatives by log s1, the frame
-  /// term, by log s2; all of mass F G with one division.
+  /// With I = mass F(u/s1) G(v/s2): offset = mass (F' G, F G'); shape = the derivatives by log s1, by the frame, by log
+  /// s2.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> e = transform(t.frame, p, t.origin);
@@ -171,7 +168,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);
     sums.shape.yy = madd(scaled_f, g.by_sigma, sums.shape.yy);
     if (kFrame == FrameGradient::kFrozen) {
-      // I_u I_v / I: the derivative with respect to the covariance of u and v while the window stays where it is.
+      // I_u I_v / I, the derivative with respect to the covariance of u and v with a fixed window.
       sums.shape.xy = madd(scale * f.by_t, g.by_t, sums.shape.xy);
     } else {
       const T ratio = t.u.half / t.v.half;  // s2 / s1
@@ -186,8 +183,8 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
     const Vec2<T> r = g.inv_sigma;
-    // Rotation of the frame per off-diagonal of Sigma is 1/(l1 - l2). At l1 = l2 the frame is
-    // arbitrary and the formula has no derivative; zero is as good as any and finite.
+    // The frame turns by 1/(l1 - l2) per off-diagonal of Sigma. At l1 = l2 the formula has no derivative; zero is
+    // finite.
     const T gap = eigenvalue_gap(cov);
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / (gap * r.x * r.y) : T(0));
     const Sym2<T> white = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy * turn, T(0.5) * sums.shape.yy};

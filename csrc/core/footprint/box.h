@@ -1,11 +1,11 @@
-// The pixel as S small Gaussians, each composited with a transmittance of its own.
+// The footprint `box`: the pixel as S small Gaussians, each with its own transmittance.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// The key of a footprint, "box1" ... "box16". From its fourth character on it is the number of samples alone.
+/// The key of a footprint, "box1" ... "box16", with the number of samples from its fourth character on.
 template <int S> struct BoxKey {
   static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0',
                                    '\0'};

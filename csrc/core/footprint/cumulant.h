@@ -1,5 +1,5 @@
-// The axis-aligned unit pixel through its cumulants: one exponential, smooth in Sigma, no
-// eigenvectors. "Weights" of docs/numerics.md.
+// The footprint `cumulant`: the axis-aligned unit pixel through its cumulants, with one exponential, smooth in Sigma
+// and without eigenvectors (docs/numerics.md, "Weights").
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -8,14 +8,14 @@ namespace ar {
 
 /// One axis of the correction to the exponent, for the diagonal entry t of the conic: a cubic
 ///   h(p, t) = P (P (c4 - c6 P) - 6 t k2) + 3 t^2 k0,  P = min(p^2, cap),
-/// from the fourth and sixth cumulant of the box. P stops where the cubic has its maximum: beyond, the
-/// truncated series would fall and the weight diverge. Weights there are below 2e-6.
+/// from the fourth and sixth cumulant of the box. P is capped at the maximum of the cubic: beyond, the truncated series
+/// would fall and the weight diverge. Weights there are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // derivatives with respect to t
 
-  /// The coefficients of `unit` times h, for p and t in coordinates where the entries of the conic are 1 / `scale` of
-  /// what they are in pixels (docs/numerics.md, "Units of the exponent").
+  /// Coefficients of `unit` times h, for p and t in coordinates in which the conic is divided by `scale`
+  /// (docs/numerics.md, "Units of the exponent").
   AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
     const T dx = scale * T(kPixelVariance), x = t * dx;
     const bool floored = T(1) - x < T(1e-6);
@@ -32,7 +32,7 @@ template <typename T> struct CumulantAxis {
     return a;
   }
 
-  /// The part of h without p: 3 t^2 k0.
+  /// 3 t^2 k0.
   AR_HD static T constant(T t, T unit = T(1), T scale = T(1)) {
     const T x = t * scale * T(kPixelVariance);
     return unit * scale * scale * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));

@@ -1,18 +1,18 @@
-// What the footprints with a window along the axes of a splat share: the eigenframe of its covariance.
+// A library for analytic.h and erf.h, whose windows are along the axes of a splat: the eigenframe of its covariance.
 #pragma once
 
 #include "core/footprint/contract.h"
 
 namespace ar {
 
-/// Standard deviations along the axes of a covariance, and (cos, sin) of the major one.
+/// Standard deviations along the axes of a covariance, and (cos, sin) of the major axis.
 template <typename T> struct Eigenframe {
   Vec2<T> sigma;
   Vec2<T> axis;
 };
 
-/// By the half angle, from whichever of its sine and cosine is larger, and det / l1: neither 0/0 for
-/// diagonal covariances nor a difference of eigenvalues (docs/numerics.md, "Eigenframe").
+/// By the larger of sine and cosine of the half angle, and det / l1: without 0/0 for diagonal covariances and without a
+/// difference of eigenvalues (docs/numerics.md, "Eigenframe").
 template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
   const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
   const T gap = eigenvalue_gap(cov);

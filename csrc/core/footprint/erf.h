@@ -1,4 +1,5 @@
-// The window of `analytic` with the exact normal distribution in place of the logistic.
+// The footprint `erf`, a reference: the window of `analytic` with the exact normal distribution instead of the
+// logistic.
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -15,7 +16,7 @@ struct Erf : FootprintDefaults {
   static constexpr bool kReference = true, kGeneric = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
-  /// Standard deviations below this [px] are raised to it, so that their reciprocals stay finite.
+  /// Lower bound of standard deviations [px], for finite reciprocals.
   static constexpr double kMinSigma = 1e-9;
 
   template <typename T> struct Shape {

@@ -1,4 +1,4 @@
-// The integral of one Gaussian over the axis-aligned unit pixel.
+// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -6,15 +6,13 @@
 
 namespace ar {
 
-/// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d: averages over
-/// the pixel of what `point` without dilation sums. They are computed by quadrature with positive weights
-/// (docs/numerics.md, "The exact integral").
+/// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d over the
+/// pixel, by quadrature with positive weights (docs/numerics.md, "The exact integral").
 ///
-/// The wide axis is the image axis of the larger variance, the narrow axis the other one. z.x depends on the wide axis
-/// alone; along it z.y falls at the rate `tilt`, and the line z.y = 0 is the ridge of the Gaussian. Where its
-/// standard deviation across the ridge is at least half a pixel, a product rule over the pixel integrates both axes.
-/// Otherwise the narrow axis is integrated in closed form, and the wide axis in strips around the places where the
-/// pixel's edges cross the ridge.
+/// The wide axis is the image axis with the larger variance, the narrow axis is the other. z.x depends on the wide axis
+/// alone; along it z.y falls at the rate `tilt`. The line z.y = 0 is the ridge of the Gaussian. If the standard
+/// deviation across the ridge is at least half a pixel, a product rule integrates both axes. Otherwise the narrow axis
+/// is integrated in closed form, and the wide axis in strips around the points where the pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
@@ -22,8 +20,8 @@ struct Exact : FootprintDefaults {
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   template <typename T> struct Shape {
-    Mat2<T> w;  ///< that of whiten_wide_first(), with the sign of its first row chosen such that tilt >= 0
-    T amp;      ///< amplitude of the Gaussian of covariance Sigma + I/12, which bounds the weight
+    Mat2<T> w;  ///< of whiten_wide_first(), with the sign of the first row that makes tilt >= 0
+    T amp;      ///< amplitude of the Gaussian with covariance Sigma + I/12, a bound of the weight
   };
 
   template <typename T> struct Terms {
@@ -59,8 +57,8 @@ struct Exact : FootprintDefaults {
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const T edge = along(g.w), tilt = -slope(g.w) / edge, steep = max(tilt, T(kMinTilt)), tail = T(kTail<T>);
-    // A strip is no longer than the Gaussian, the crossing or the pixel; sqrt(1 + tilt^2) is the rate
-    // at which the integrand varies along it.
+    // The Gaussian, the crossing and the pixel limit a strip. The integrand varies along it at the rate sqrt(1 +
+    // tilt^2).
     const T length = min(T(2) * min(tail, tail / steep), abs(edge)) * sqrt(T(1) + tilt * tilt);
     const T panels = min(max(T(1), T(1) + length / T(kPanel)), T(kMaxPanels));
     return {g.w, origin, opacity, wide_x(g.w), edge, across(g.w), tilt, tail / steep, int(panels)};
@@ -94,8 +92,7 @@ struct Exact : FootprintDefaults {
     Sym2<V> second;
   };
 
-  /// Standard deviations from the ridge beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32
-  /// there.
+  /// Standard deviations beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32.
   template <typename T> static constexpr double kTail = sizeof(T) == 4 ? 7 : 12;
   /// Longest panel for kManyNodes, in standard deviations of the integrand along it.
   static constexpr double kPanel = 3.3;
@@ -122,14 +119,14 @@ struct Exact : FootprintDefaults {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// Where the pixel begins and ends along an axis, seen from its point next to the mean: [-1, 0], [0, 1] or in between
-  /// [px]. Seen from there, rounding does not move the edges that matter, however small or far away the Gaussian is.
+  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px]: rounding then does not move
+  /// the edges that matter, for Gaussians of any size and distance.
   template <class V> struct Edges {
     V begin, end;
     AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }
   };
   template <class V> struct Pixel {
-    Vec2<V> z;  ///< whitened coordinates of the point next to the mean
+    Vec2<V> z;  ///< whitened coordinates of the point nearest to the mean
     Edges<V> wide, narrow;
   };
 
@@ -168,7 +165,7 @@ struct Exact : FootprintDefaults {
   template <typename T, class V> AR_HD static Moments<V> by_strips(const Terms<T>& t, const Pixel<V>& pixel) {
     const V zero = V(T(0)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
     const V along = V(t.along), across = V(t.across), scale = V(T(1) / max(t.tilt, T(kMinTilt)));
-    // Steps in z.x: to two edges of the pixel, and to where the ridge crosses the other two.
+    // Steps in z.x to two edges of the pixel, and to the crossings of the ridge with the other two.
     const V edge = along * pixel.wide.begin, opposite = along * pixel.wide.end;
     const V first = min(edge, opposite), last = max(edge, opposite);
     const V enters = madd(across, pixel.narrow.begin, pixel.z.y) * scale;
@@ -182,7 +179,7 @@ struct Exact : FootprintDefaults {
     add_strip(t, pixel, begin, inside, m);
     add_strip(t, pixel, outside, end, m);
     if (t.across > T(2 * kTail<T>)) {
-      // In between, the pixel holds all of the ridge's width.
+      // Between the strips the pixel covers all of the ridge's width.
       const V from = pixel.z.x + inside, to = pixel.z.x + outside;
       const NormalMoments<V> ridge = abs(t.along) <= T(0.5)
                                          ? short_interval_moments(V(T(0.5)) * (from + to), outside - inside)

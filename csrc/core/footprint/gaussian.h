@@ -1,8 +1,7 @@
-// What the footprints that are Gaussians themselves share: point, mip, box and moment, and in part cumulant.
+// A library for the footprints that are Gaussians: point, mip, box and moment, and in part cumulant and exact.
 //
-// A Gaussian is kept as a whitening matrix w with w^T w = (Sigma + v I)^-1, so that the exponent is
-// -|w d|^2 / 2. Unlike the conic form a dx^2 + 2 b dx dy + c dy^2 it cannot turn positive, and it
-// does not cancel for long needles (docs/numerics.md, "Whitening").
+// A Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. Unlike the conic form, the exponent
+// -|w d|^2 / 2 cannot become positive, and does not cancel for long needles (docs/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -12,29 +11,29 @@ namespace ar {
 template <typename T> struct GaussianShape {
   Lower2<T> w;  ///< whitening matrix [1/px]
   T amp;        ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
-  T x_given_y;  ///< standard deviation of x given y, if y is the wide axis, else zero [px]: see wide_first()
+  T x_given_y;  ///< standard deviation of x given y if y is the wide axis, else zero [px]; for wide_first()
 };
 
-/// Whitening matrix of c: a Cholesky factor, x first.
+/// A Cholesky factor of c^-1, x first.
 template <typename T> AR_HD Lower2<T> whiten(Cov2d<T> c) {
   const T across = sqrt(quotient(c.xx, c.det));  // 1 / std. dev. of y given x
   return {quotient(T(1), sqrt(c.xx)), -across * quotient(c.xy, c.xx), across};
 }
-/// The same with the wide axis first.
+/// With the wide axis first.
 template <typename T> AR_HD Mat2<T> whiten_wide_first(Cov2d<T> c) {
   if (c.xx >= c.yy) return all_of(whiten(c));
   const Lower2<T> w = whiten(Cov2d<T>{c.yy, c.xy, c.xx, c.det});
   return {T(0), w.xx, w.yy, w.yx};
 }
 
-/// The shape of a Gaussian of covariance c. x_given_y may be an approximation: it is a factor of all entries of
-/// wide_first(), so that its error makes the ellipse larger or smaller, within kLevelSlack, but does not turn it.
+/// x_given_y may be an approximation: it is a factor of all entries of wide_first(), so that its error scales the
+/// ellipse, within kLevelSlack, and does not turn it.
 template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
   return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
 }
 
-/// whiten_wide_first() of its covariance. What tells which boxes of pixels a splat reaches takes it, since in these
-/// coordinates a box fills more of its bounding box (docs/numerics.md, "Whitening").
+/// whiten_wide_first() of the shape's covariance, for BoxReach (bin.h): in these coordinates a box of pixels fills more
+/// of its bounding box (docs/numerics.md, "Whitening").
 template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
   const Lower2<T>& w = shape.w;
   const bool wide_x = shape.x_given_y == T(0);
@@ -43,7 +42,7 @@ template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
           wide_x ? w.yx : madd(w.xx, w.xx, w.yx * w.yx) * shape.x_given_y, wide_x ? w.yy : w.yx * across};
 }
 
-/// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
+/// Exponents have base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
 inline constexpr double kBase2 = 0.84932180028801904272;
 
 /// Level outside which amp * opacity * exp(-|w d|^2 / 2) < 1/255.
@@ -51,9 +50,8 @@ template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
   return T(2) * std::log(T(1 / kAlphaMin) * opacity * amp);
 }
 
-/// Gradient of a sum of Gaussians from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z,
-/// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma; `variance` was
-/// added to Sigma.
+/// Gradient from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z, `shape` = sum g I z z^T, and
+/// `weighted` = sum g I, zero if the amplitude does not depend on Sigma. `variance` was added to Sigma.
 template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
   // With kBase2 = 1: d log I = z.w dmu + tr(z z^T w dSigma w^T)/2 + d log amp
   const T half = T(0.5 / (kBase2 * kBase2));
@@ -69,9 +67,8 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeG
 /// Variance of each of the S Gaussians of the box footprint [px^2].
 template <int S> inline constexpr double kBoxVariance = S == 1 ? kPixelVariance : 1.0 / (24 * S);
 
-/// Node s of the box footprint with S samples [px]. The mixture of the Gaussians at the nodes has the mean and the
-/// covariance of the pixel. Beyond one sample the nodes were found by a search on trained and random scenes
-/// (docs/numerics.md, "Nodes").
+/// Node s of `box` with S samples [px]. The mixture of the Gaussians at the nodes has the mean and covariance of the
+/// pixel. The nodes were found by a search on trained and random scenes (docs/numerics.md, "Nodes").
 template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
   constexpr Vec2<double> kNodes4[] = {{-0.12083, -0.36226}, {0.36226, -0.12083}};
   constexpr Vec2<double> kNodes16[] = {{0.26975, -0.14597}, {0.14427, -0.43939}, {0.06200, -0.14646},
@@ -79,12 +76,11 @@ template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
                                        {0.10473, 0.35640},  {0.39573, 0.39912}};
   static_assert(S == 1 || S == 4 || S == 16, "box has 1, 4 or 16 samples");
   if (S == 1) return {0, 0};
-  // Node s + S / 2 is the negative of node s, so only the first half is listed.
+  // Node s + S / 2 is the negative of node s.
   const Vec2<double> n = S == 4 ? kNodes4[s % 2] : kNodes16[s % 8];
   return s < S / 2 ? n : Vec2<double>{-n.x, -n.y};
 }
 
-/// Largest coordinate of the nodes [px].
 template <int S> constexpr double box_reach() {
   double reach = 0;
   for (int s = 0; s < S; ++s) {
@@ -96,8 +92,7 @@ template <int S> constexpr double box_reach() {
 
 template <int S> struct GaussianSample;
 
-/// S Gaussians in place of one pixel: all that blending has to know. It is the same code for all footprints that are
-/// Gaussians, whatever variance they have added to the covariance.
+/// S Gaussians instead of a pixel: the code of blending for all footprints that are Gaussians, with any variance.
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();
@@ -107,7 +102,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> struct Terms {
     Lower2<T> w;      ///< whitening matrix times kBase2
     T log_peak;       ///< log2(opacity * amp)
-    Vec2<T> node[S];  ///< each sample's node in whitened coordinates, seen from the mean
+    Vec2<T> node[S];  ///< of each sample, whitened, relative to the mean
   };
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
@@ -133,7 +128,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  /// log2 of alpha at the whitened coordinates z. z.y takes longer to compute, and so is added last.
+  /// log2 of alpha. z.y takes longer to compute, and is added last.
   template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
     return madd(-z.y, z.y, madd(-z.x, z.x, V(t.log_peak)));
   }
@@ -153,14 +148,14 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return all_of(T(1 / kBase2) * shape.w); }
 };
 
-/// One of the S Gaussians of GaussianPixels<S>, for a lane of its own: p is where it lies.
+/// One of the S Gaussians of GaussianPixels<S>, at p, for its own lane.
 template <int S> struct GaussianSample : GaussianPixels<1> {
   static constexpr int kLanes = S;
   static constexpr double kReach = box_reach<S>();
   AR_HD static constexpr Vec2<double> node(int s) { return box_node<S>(s); }
 };
 
-/// Footprints that prepare a GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.
+/// Base of footprints with GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.
 template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S> {
   using Pixels = GaussianPixels<S>;
   static constexpr const char* kPage = kCompensated ? "compensated" : "gaussian";

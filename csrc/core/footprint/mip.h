@@ -1,4 +1,4 @@
-// Mip-Splatting's 2D filter: the Gaussian convolved with a Gaussian pixel of the given variance.
+// The footprint `mip`, the 2D filter of Mip-Splatting: the Gaussian convolved with a Gaussian pixel.
 #pragma once
 
 #include "core/footprint/gaussian.h"

@@ -1,19 +1,19 @@
-// The pixel as S equal square cells, each composited with a transmittance of its own. A splat is evaluated at the
-// centroid of the light that the splats in front have left in the cell (docs/numerics.md, "Moving nodes").
+// The footprint `moment`: the pixel as S equal square cells, each with its own transmittance. A splat is evaluated at
+// the centroid of the light that earlier splats have left in the cell (docs/numerics.md, "Moving nodes").
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// The key of a footprint, "moment1" ... "moment16". From its seventh character on it is the number of cells alone.
+/// The key of a footprint, "moment1" ... "moment16", with the number of cells from its seventh character on.
 template <int S> struct MomentKey {
   static constexpr char kText[] = {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
 };
 
-/// n x n cells, S = n^2. In front of the first splat each is a Gaussian of the cell's variance at the cell's centre,
-/// like a sample of `box`. `Pixels` and `kPage` are reset, because nodes of the base class do not move.
+/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian of the cell's variance at its centre, like a
+/// sample of `box`. `Pixels` and `kPage` are reset, because nodes of the base class do not move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
   static constexpr const char* kPage = nullptr;
@@ -77,28 +77,24 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return grad;
   }
 
-  /// Where the node of sample s may be [px from the pixel's centre]: its cell.
   template <typename T> AR_HD static Bounds<T> cell(int s) {
     const int x = 2 * (s % kSide), y = 2 * (s / kSide);
     return {{edge<T>(x), edge<T>(y)}, {edge<T>(x + 2), edge<T>(y + 2)}};
   }
 
-  /// Whitened coordinates of a node. `place`: of the node, relative to a point whose whitened coordinates are `from`.
   template <typename T, class V> AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> from, Vec2<V> place) {
     return transform(t.w, place, from);
   }
-  /// whitened() of the point (0, y), without the products with zero.
   template <typename T, class V> AR_HD static Vec2<V> whitened_row(const Terms<T>& t, V y) {
     return {V(t.node[0].x), madd(V(t.w.yy), y, V(t.node[0].y))};
   }
 
-  /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement, in the unit of w^-1;
-  /// what is returned is the same behind the splat, where `cell` allows it. alpha is as if the splat was composited;
-  /// `mask` says whether it was.
+  /// move() with whitened coordinates z. `at` is the position or the displacement of the node, in the unit of w^-1. It
+  /// returns the same after the splat, clamped by `cell`. alpha is as if the splat was composited; `mask`: it was.
   template <typename T, class V, class Cell>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
     const Vec2<V> along = transform_transposed(t.w, z);
-    // The same bits in two ways: a thread of a device skips single instructions at no cost.
+    // Two forms with the same bits: a thread of a GPU skips instructions at no cost.
     if constexpr (std::is_same_v<MaskOf<V>, bool>) {
       const V length = length_of<T, V, Cell>(alpha);
       if (mask) at = cell.held(length, along, at);
@@ -109,8 +105,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
   /// alpha_and_move_vjp() likewise, added to `sums` (docs/numerics.md, "Adjoint of moving nodes", with q for v r y).
-  /// dL_dat is in kMoveGradUnit. `weighted` is alpha dL_dalpha, and zero where the splat was not composited, as alpha
-  /// is. A coordinate that move_in() has held at a bound does not depend on anything.
+  /// dL_dat is in kMoveGradUnit. `weighted` is alpha dL_dalpha; both are zero where the splat was not composited. A
+  /// coordinate that move_in() has clamped is constant.
   template <typename T, class V, class Cell>
   AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
                                               Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
@@ -129,9 +125,9 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
-  /// Moves `at` as move_in() does. With J the derivative of the place behind with respect to that in front, the dL_dat
-  /// of add_alpha_and_move_in_vjp() in front is J^T times that behind, and dL_dalpha times MoveSlope::alpha. `free`:
-  /// alpha is not held at its cap.
+  /// Moves `at` as move_in() does. With J the derivative of the position after with respect to the position before,
+  /// dL_dat of add_alpha_and_move_in_vjp() before is J^T (dL_dat after) + dL_dalpha MoveSlope::alpha. `free`: alpha is
+  /// not the cap.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
@@ -156,15 +152,14 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
-  /// step() alpha / (1 - alpha). The factor is in the divisor, where it costs nothing on a device. On processors
-  /// without fused multiply-adds the divisor is rounded twice, so that up to 1 / (1 - kAlphaMax) = 100 roundings of the
-  /// length are lost, 6e-6 of it in float.
+  /// step() alpha / (1 - alpha), with the factor in the divisor, where it is free on a device. Without fused
+  /// multiply-adds the divisor is rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings, 6e-6 in float.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha) {
     const V per_step = V(T(1 / step<Cell>()));
     return divide(alpha, madd(-per_step, alpha, per_step));
   }
 
-  /// at + v r (Sigma + v I)^-1 d, before it is held.
+  /// at + v r (Sigma + v I)^-1 d, before the clamp.
   template <class V> AR_HD static Vec2<V> moved(V length, Vec2<V> along, Vec2<V> at) {
     return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
   }

@@ -1,13 +1,12 @@
-// What the footprints with the exact normal distribution share: Gauss-Legendre rules, moments of the
-// normal density over an interval.
+// A library for erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval.
 #pragma once
 
 #include "core/footprint/contract.h"
 
 namespace ar {
 
-/// Gauss-Legendre rule with N nodes on [-1/2, 1/2]; the weights add up to 1. For exp(-x^2 / (2 s^2))
-/// it errs by at most (N!)^3 / ((2N + 1) ((2N)!)^2 2^N s^(2N)).
+/// Gauss-Legendre rule with N nodes on [-1/2, 1/2] and weights that add up to 1. Its error for exp(-x^2 / (2 s^2)) is
+/// at most (N!)^3 / ((2N + 1) ((2N)!)^2 2^N s^(2N)).
 template <int N, typename T> struct GaussLegendre {
   AR_HD static constexpr T node(int i) { return i < N / 2 ? -positive(N / 2 - 1 - i).x : positive(i - N / 2).x; }
   AR_HD static constexpr T weight(int i) { return i < N / 2 ? positive(N / 2 - 1 - i).y : positive(i - N / 2).y; }
@@ -43,8 +42,7 @@ template <int N, typename T> struct GaussLegendre {
   }
 };
 
-/// Numbers of nodes for an interval of at most half a standard deviation (few), and of more (many): at most two for a
-/// pixel, and 3.3 for a panel of exact.h.
+/// Nodes for an interval of at most half a standard deviation (few), or of up to 3.3 (many).
 template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
 template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
 
@@ -59,11 +57,11 @@ template <class V> struct NormalMoments {
   V value, first, second;
 };
 
-/// Over [a, b], in closed form. The differences lose digits where b - a is below 1/2.
+/// Over [a, b], in closed form. The differences lose digits if b - a < 1/2.
 template <class V> AR_HD NormalMoments<V> interval_moments(V a, V b) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), root_half = V(T(0.70710678118654752440)), root_half_pi = V(T(1.2533141373155002512));
-  // Mirrored, if necessary, to the side where both values of erfc are small.
+  // Mirrored to the side where both values of erfc are small.
   const MaskOf<V> mirrored = a + b < zero;
   const V lo = select(mirrored, -b, a), hi = select(mirrored, -a, b);
   const V at_lo = normal(lo), at_hi = normal(hi), first = at_lo - at_hi;
@@ -85,18 +83,17 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   return m;
 }
 
-/// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d: like that
-/// of `point`, f has no amplitude that depends on Sigma, so that df = f (z . w dmean + tr(z z^T w dSigma w^T) / 2).
+/// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d:
+/// df = f (z . w dmean + tr(z z^T w dSigma w^T) / 2).
 template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, GradFrame frame) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
   return {transform_transposed(w, sums.offset), w, half, T(0), T(0), frame};
 }
 
-/// What integrating over the pixel adds at most, along one axis, to the level of the Gaussian of
-/// variance 1/t = sigma^2 + 1/12 that stands for it. At sigma = 0 the ratio of the two densities is
-/// greatest at the pixel's edge, 2 ln(sqrt(2 pi / 12) exp(3/2)) = 2.353 < 144/61, and convolving both
-/// with the splat cannot raise it: 144/61 is safe for every splat. That it falls as t^2 is checked
-/// numerically in the tests.
+/// Along one axis, a bound of how much the integral over the pixel raises the level of the Gaussian with variance
+/// 1/t = sigma^2 + 1/12. At sigma = 0 the ratio of the two densities is largest at the pixel's edge:
+/// 2 ln(sqrt(2 pi / 12) exp(3/2)) = 2.353 < 144/61. A convolution of both with the splat cannot raise it. The tests
+/// check that it falls as t^2.
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 }  // namespace ar

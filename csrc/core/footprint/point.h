@@ -1,12 +1,11 @@
-// The Gaussian at the pixel's centre, widened by `dilation`: 3D Gaussian Splatting as of 2023.
+// The footprint `point`, that of 3DGS (2023): the value of the Gaussian, widened by `dilation`, at the pixel centre.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// I = exp(-d^T (Sigma + dilation I)^-1 d / 2). The amplitude is not compensated, so a splat gains
-/// mass as it shrinks.
+/// I = exp(-d^T (Sigma + dilation I)^-1 d / 2). Without a compensating amplitude, small splats gain mass.
 struct Point : GaussianFootprint<1, false> {
   static constexpr const char* kName = "point";
   static constexpr Option kOption = {"dilation", nullptr, 0.3};

@@ -1,4 +1,4 @@
-// Every footprint the library knows. A new one is a header and a line here.
+// The list of footprints. A new footprint is a header and an entry here.
 #pragma once
 
 #include <cstddef>
@@ -20,7 +20,6 @@ namespace ar {
 using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
                                  Cumulant, Box<1>, Box<4>, Box<16>, Moment<1>, Moment<4>, Moment<16>, Erf, Exact>;
 
-/// The key of a footprint: its kKey, or without one its name.
 template <class F> constexpr const char* key_of() {
   if constexpr (std::is_same_v<decltype(F::kKey), const std::nullptr_t>) {
     return F::kName;
@@ -34,13 +33,13 @@ template <class Function, class... F> AR_HD void for_each_footprint(FootprintLis
   (f(F{}), ...);
 }
 
-/// Calls f(F{}) for the footprint at place `index` of the list.
+/// Calls f(F{}) for the footprint with this index in the list.
 template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
   int place = 0;
   ((index == place++ ? (f(F{}), true) : false) || ...);
 }
 
-/// Place in the registry of the footprint whose key is `key`; -1 if there is none.
+/// Index of the footprint with this key, or -1.
 inline int find_footprint(std::string_view key) {
   int found = -1, place = 0;
   for_each_footprint(Footprints{}, [&](auto f) {

@@ -9,7 +9,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/bin.cuh"
-#include "cuda/composite.cuh"
+#include "cuda/tile.cuh"
 #include "cuda/splat_tiles.cuh"
 
 namespace ar::cuda {

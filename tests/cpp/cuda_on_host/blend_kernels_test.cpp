@@ -6,7 +6,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/blend.cuh"
+#include "cuda/still/front.cuh"
 #include "random_splats.h"
 
 namespace ar::cuda {

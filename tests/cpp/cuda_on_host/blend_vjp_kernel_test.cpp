@@ -6,7 +6,7 @@
 #include <gtest/gtest.h>
 
 #include "core/footprint/registry.h"
-#include "cuda/blend_vjp.cuh"
+#include "cuda/still/vjp.cuh"
 #include "random_splats.h"
 #include "rounded.h"
 

@@ -5,7 +5,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/blend_groups_vjp.cuh"
+#include "cuda/channels/groups_vjp.cuh"
 #include "cuda/project_vjp.cuh"
 #include "random_splats.h"
 

@@ -5,10 +5,10 @@
 #include <gtest/gtest.h>
 
 #include "core/inspect.h"
-#include "cuda/blend_listed.cuh"
-#include "cuda/blend_moving_maps.cuh"
-#include "cuda/blend_moving_segments.cuh"
-#include "cuda/blend_moving_vjp.cuh"
+#include "cuda/moment/listed.cuh"
+#include "cuda/moment/maps.cuh"
+#include "cuda/moment/vjp_segments.cuh"
+#include "cuda/moment/vjp_walk.cuh"
 #include "cuda/plan.cuh"
 #include "random_splats.h"
 

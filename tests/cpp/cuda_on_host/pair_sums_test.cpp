@@ -5,7 +5,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/blend_vjp_sums.cuh"
+#include "cuda/still/vjp_sums.cuh"
 
 namespace ar::cuda {
 namespace {

@@ -8,7 +8,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/cut_lists.cuh"
+#include "cuda/moment/cut_lists.h"
 #include "cuda/plan.cuh"
 
 namespace ar::cuda {

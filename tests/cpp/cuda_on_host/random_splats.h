@@ -5,7 +5,7 @@
 #include <random>
 #include <vector>
 
-#include "cuda/composite.cuh"
+#include "cuda/tile.cuh"
 
 namespace ar::cuda {
 

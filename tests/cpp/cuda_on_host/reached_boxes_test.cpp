@@ -9,7 +9,7 @@
 #include <random>
 
 #include "core/footprint/registry.h"
-#include "cuda/blend_moving_maps.cuh"
+#include "cuda/moment/maps.cuh"
 
 namespace ar::cuda {
 namespace {
