@@ -1,7 +1,6 @@
-// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. From what project or
-// shape_rows wrote, count_depths counts pairs, and digits of depth keys. By depth, emit_pairs and emit_long_pairs write
-// a pair for each tile that a splat touches. When pairs are sorted by tile, tile_offsets finds the first pair of each
-// tile.
+// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. count_depths counts splats,
+// pairs and digits of depth keys. After the sort by depth, emit_pairs and emit_long_pairs write a pair for each tile
+// that a splat touches. After the sort by tile, tile_offsets finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>
@@ -27,8 +26,8 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
   return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
 }
 
-/// Numbers the slots of a warp's kRows x 32 splats, from counts.pairs on, and counts them there. All lanes must call
-/// it. `ranges`: of the lane's first splat; the next is `stride` later.
+/// Hands out slots to a warp's kRows x 32 splats, and adds to counts.pairs. A lane has splats `stride` apart; `ranges`:
+/// of its first. All lanes must call it.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -48,8 +47,7 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
   }
 }
 
-/// Counts splats with pairs, pairs, and digits of depth keys. Zeroes memory for later kernels.
-/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits].
+/// Also sets memory of later kernels to zero. keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits]. counts: [1].
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
@@ -105,7 +103,7 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
-/// Digits of the sort by tile: as few, then as short, as the number of the last tile allows.
+/// Digits of the sort by tile: few, then short.
 struct TileDigits {
   static constexpr int kMostBits = kTileDigitBits, kMostPasses = kTileDigits;
   int passes = 1, bits = kMostBits - 1;
@@ -124,12 +122,12 @@ struct TileDigits {
   }
 };
 
-/// Writes the pairs of a block, and counts the digits of their tiles.
+/// Writes pairs, and counts the digits of their tiles for a block.
 class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
 
-  /// `counts`: [kMostCounts], shared. All threads must call it; __syncthreads() before write().
+  /// counts: [kMostCounts], shared. All threads must call it, and __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
@@ -157,7 +155,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// Lane of a splat with few tiles, and bit of its mask.
+/// A pair of a splat with few tiles: its lane, and a bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -169,7 +167,7 @@ struct MaskedPair {
 
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// The pairs of earlier blocks, from `status` [blocks] as in sort.cuh. All lanes must call it.
+/// Pairs of earlier blocks. status: [blocks], words as in sort.cuh. All lanes must call it.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -186,11 +184,10 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Words of EmitParams::status: blocks that have begun, long splats, the count of each block.
+/// Indices in EmitParams::status: blocks that have begun; long splats; counts of blocks.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// In the order of depth; the pairs of a splat by rows of tiles. Of long splats, whose tiles are not among 8x8, it
-/// lists the positions alone.
+/// Writes pairs in order of depth, those of a splat by rows of tiles. Long splats (tiles beyond 8x8) are only listed.
 __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -228,10 +225,10 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // While earlier blocks count, the tiles are listed in shared memory; then neighbouring lanes write to neighbouring
+  // While earlier blocks count, tiles are listed in shared memory. Then neighbouring lanes write to neighbouring
   // addresses.
   const int warp = threadIdx.x / 32;
-  int up_to[kEmitRows];  // listed by lanes up to this one
+  int up_to[kEmitRows];  // listed, up to this lane
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const TileMask mask = few_tiles(touched[row]);
@@ -302,7 +299,7 @@ struct BoxOfTiles {
   __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
 };
 
-/// The tiles of a splat's bounding box, and of a pixel around it for rounding.
+/// Of a splat's bounding box, and a pixel more for rounding.
 __device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGrid grid) {
   const auto range = [&](float middle, float half, int size) {
     return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
@@ -311,15 +308,15 @@ __device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGri
           range(support.mean.x, support.half_width + support.reach, grid.width)};
 }
 
-/// Pairs of patches, where there is no room for all pairs of tiles. Their slots are the splats, to whose rows all
-/// patches add. Slow, with one block, but rare.
+/// Writes the pairs of patches, if there is no room for those of tiles. Their slots are the splats. One block: slow but
+/// rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
   const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. The whole image always fits.
+  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. One for the whole image always fits.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
@@ -356,8 +353,8 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// A warp for each long splat; or one block for the pairs of patches. The nearest splats are often long, and would all
-/// be in a few blocks of emit_pairs.
+/// A warp per long splat: the nearest splats are often long, and all in a few blocks of emit_pairs. Or one block, for
+/// the pairs of patches.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -396,7 +393,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   writer.finish();
 }
 
-/// Also reports the number of pairs to the host. tiles: [counts->listed]. tile_offsets: [tile_count + 1].
+/// Also reports the number of pairs to the host. tiles: [counts->listed]. counts: [1]. tile_offsets: [tile_count + 1].
 __global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {

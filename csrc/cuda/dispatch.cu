@@ -1,5 +1,5 @@
-// Entry points of blending for csrc/torch: blend(), blend_vjp() and inspect() choose the family of kernels by the table
-// of dispatch.h.
+// Entry points of blending for csrc/torch. blend() and blend_vjp() call the family of kernels that the table of
+// dispatch.h names. inspect() launches its kernel.
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/launch.cuh"
@@ -10,9 +10,8 @@ namespace {
 
 constexpr int kClearBlock = 256;
 
-/// Before the backward kernels: no chunk has been claimed; and where there are more pairs than room, sets the rows of
-/// splats to zero, to which all tiles add: pair_grads [n, kPairGradWidth], once for all groups of channels, and
-/// channel_sums [n, width] for the group of `width` channels from `first` on.
+/// Sets *chunks_taken to zero. If lists are of patches, also the rows that tiles add to: pair_grads for the first group
+/// of channels, and channel_sums [n, width] for every group.
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;

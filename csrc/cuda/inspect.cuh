@@ -1,5 +1,5 @@
-// The kernel of inspect, and its launch for blend.cu. It walks the lists of splats as blending does, and writes
-// statistics of every pixel and of every Gaussian (core/inspect.h).
+// Kernel inspect; dispatch.cu launches it. It walks lists as blending does, and writes statistics of pixels and
+// Gaussians (core/inspect.h).
 #pragma once
 
 #include <algorithm>
@@ -12,8 +12,8 @@ namespace ar::cuda {
 
 template <int kSide> inline constexpr int kInspectThreads = std::max(32, kSide* kSide);
 
-/// A block per tile of kSide x kSide pixels, a warp per subtile. A small tile has the subtiles of the first column of a
-/// large one; the smallest has a part of one subtile. F: the footprint.
+/// A block per tile of kSide x kSide pixels, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column,
+/// tiles of 4x4 a part of one subtile. F: the footprint.
 template <class F, int kSide>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();

@@ -1,7 +1,7 @@
-// The kernels of the backward pass after blend_vjp; project.cu launches them. `project_vjp` reads gradients of pairs,
-// and writes gradients of Gaussians; `zero_culled_grads` writes zeros for Gaussians without pairs, beside blend_vjp.
-// For public rows, `row_grads` writes gradients of rows, and `project_rows_vjp` reads these, perhaps on another rank.
-// And `sum_channels` writes gradients of further channels.
+// The kernels of the backward pass after blend_vjp; project.cu launches them. project_vjp reads gradients of pairs, or
+// of public rows (perhaps on another rank), and writes gradients of Gaussians. zero_culled_grads writes zeros for
+// Gaussians without pairs, beside blend_vjp. row_grads sums pairs into gradients of public rows, and sum_channels into
+// gradients of channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,8 +9,7 @@
 
 namespace ar::cuda {
 
-/// Gaussians of a warp, adjacent in memory. If none has pairs, zero_culled_grads writes their gradients, else
-/// project_vjp.
+/// Adjacent Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
 inline constexpr int kGradRows = 32;
 static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
@@ -21,7 +20,7 @@ __device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(i
 struct SplatSums {
   float value[kPairGradWidth];
 
-  /// Adds up to kRows rows, loaded at once: [count, kPairGradWidth].
+  /// Adds up to kRows rows [count, kPairGradWidth], loaded at once.
   template <int kRows> __device__ void add(const float* rows, int count) {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
@@ -72,7 +71,6 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   return sums;
 }
 
-/// Streaming, as nobody reads zeros soon.
 __device__ inline void zero_rows(float* to, int count) {
   if (count % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
     for (int e = lane_id(); e < count / 4; e += 32) store_streaming(reinterpret_cast<float4*>(to) + e, {0, 0, 0, 0});
@@ -92,16 +90,16 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
-/// `rows` as a view in which the first row has index `first`.
+/// `rows` as a view that begins with index `first`.
 template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
 
-/// In shared memory, without colours.
+/// Gaussians of a warp in shared memory, without colours.
 struct GaussianRows {
   float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
-  /// Begins to load the Gaussians of `lanes`, from `first` on. Returns views, to read after wait_for_copies().
+  /// Begins to load Gaussians first + k of lanes k. Returns views, to read after wait_for_copies().
   __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
@@ -122,18 +120,17 @@ struct GaussianRows {
   }
 };
 
-/// The source of project_vjp.
+/// project_vjp from sums of pairs.
 struct FromPairs {
   using Params = ProjectVjpParams;
-  /// Whether zero_culled_grads writes zeros.
-  static constexpr bool kZeroed = true;
+  static constexpr bool kZeroed = true;  ///< by zero_culled_grads
   const ProjectVjpParams& params;
 
-  /// count: 0 without gradient.
+  /// Count 0: no gradient.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
   /// All lanes must call it.
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
-  /// Calls use(function from splat to gradient, ShownGrad, MeanSums), if range.count > 0.
+  /// Calls use(function from splat to gradient, ShownGrad, MeanSums).
   template <class Cam, class Use>
   __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, const SplatSums& sums,
                         Use&& use) const {
@@ -156,7 +153,7 @@ struct FromPairs {
   }
 };
 
-/// The source of project_rows_vjp.
+/// project_vjp from gradients of public rows.
 struct FromRows {
   using Params = ProjectRowsVjpParams;
   static constexpr bool kZeroed = false;
@@ -177,14 +174,14 @@ struct FromRows {
   }
 };
 
-/// Coefficients are made in shared memory, then added.
+/// Adds gradients to arrays; those of coefficients are made in shared memory first.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
   __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
 };
 
 /// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out:
-/// GaussianGrads<float> or, with FromRows, StagedGrads.
+/// GaussianGrads<float>, or StagedGrads with FromRows.
 template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
 __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks,
                                                                  kProjectThreads))
@@ -291,7 +288,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
-/// For channels that are columns of pair_grads. A thread per splat.
+/// From columns of pair_grads. A thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
@@ -305,8 +302,8 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// For groups of C channels; channel_sums: [max(capacity, n), C]. A splat has kSumLanes lanes, with many pairs a block;
-/// a lane has four channels.
+/// From channel_sums [max(capacity, n), C]. A splat has kSumLanes lanes, or the block if it has many pairs. A lane has
+/// four channels.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
@@ -319,7 +316,7 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
   const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
-  // Of rows `row`, `row` + step, ...
+  // Rows `row`, `row` + step, ...
   const auto sum_rows = [&](const PairRange& of_splat, int row, int step) {
     const auto* quads = reinterpret_cast<const float4*>(params.channel_sums) + int64_t(of_splat.first) * kQuads + quad;
     float4 sum = {0, 0, 0, 0};

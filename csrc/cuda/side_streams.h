@@ -1,5 +1,4 @@
-// A library for the CUDA backend (torch/backend_cuda.cpp): a stream for kernels that run beside those of the caller's
-// stream. It makes streams and events, and launches nothing.
+// A library for torch/backend_cuda.cpp: a stream for kernels that run beside the caller's stream.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -8,8 +7,8 @@
 
 namespace ar::cuda {
 
-/// While this object exists, stream() runs beside the caller's stream: after the work that was there before, and before
-/// the work that comes there after. Each thread has a side stream on each device.
+/// Work on stream() begins after earlier work of the caller's stream. Work after this object's end waits for it. There
+/// is a stream per thread and device.
 class SideStream {
  public:
   explicit SideStream(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {
@@ -24,7 +23,7 @@ class SideStream {
   cudaStream_t stream() const { return own_.stream; }
   /// For LaunchShape::begun of a kernel on stream().
   cudaEvent_t begun() const { return own_.begun; }
-  /// Later kernels of the caller's stream come after the blocks of that kernel, which would otherwise wait for room.
+  /// Later kernels of the caller's stream wait for the blocks of that kernel to begin, which else would wait for room.
   void wait_until_begun() const { cudaStreamWaitEvent(caller_, own_.begun, 0); }
 
  private:
@@ -33,7 +32,7 @@ class SideStream {
     cudaEvent_t fork, begun, end;
 
     Own() {
-      // Also while a graph is captured, because nothing here is part of the graph.
+      // Also during the capture of a graph: nothing here is part of it.
       cudaStreamCaptureMode mode = cudaStreamCaptureModeRelaxed;
       cudaThreadExchangeStreamCaptureMode(&mode);
       cudaStreamCreateWithFlags(&stream, cudaStreamNonBlocking);

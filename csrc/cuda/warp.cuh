@@ -1,4 +1,4 @@
-// A library for all kernels: sums, votes and searches over the lanes of a warp, which all lanes must call, and loads,
+// A library for all kernels. Sums, votes and searches over the lanes of a warp, which all lanes must call; loads,
 // stores and copies, which single lanes may call.
 #pragma once
 
@@ -10,7 +10,7 @@ inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
 
-/// In every lane; in a fixed order.
+/// In every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
@@ -20,13 +20,13 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
-/// The sum over this lane and lane_id() ^ offset: of x in the lower lane, of y in the upper one.
+/// The sum over this lane and lane_id() ^ offset: of y, if this is the upper lane, else of x.
 __device__ inline float sum_of_pair(const float& x, const float& y, bool upper, int offset) {
   const float keep = upper ? y : x, give = upper ? x : y;
   return keep + __shfl_xor_sync(kAllLanes, give, offset);
 }
 
-/// Lanes below 16 get the sum of x, the others of y: 5 shuffles instead of 10, and the bits of warp_sum.
+/// Lanes below 16 get the warp_sum of x, the others of y.
 __device__ inline float warp_sum_of_two(float x, float y) {
   float sum = sum_of_pair(x, y, lane_id() & 16, 16);
 #pragma unroll
@@ -34,7 +34,7 @@ __device__ inline float warp_sum_of_two(float x, float y) {
   return sum;
 }
 
-/// Over the lanes up to this one. T has shuffle(), shuffle_up() and a + that need not commute.
+/// Up to this lane. T has shuffle(), shuffle_up() and a +, which need not commute.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
 #pragma unroll
   for (int offset = 1; offset < 32; offset *= 2) {
@@ -44,7 +44,7 @@ template <typename T> __device__ T warp_inclusive_sum(T v) {
   return v;
 }
 
-/// Over the threads before this one, of a block of kWarps warps or of one warp. `all`: over all. `zero` + v is v.
+/// Over the threads before this one in a block of kWarps warps; with kWarps = 1 in a warp. `all`: over all threads.
 template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all) {
   const T up_to = warp_inclusive_sum(own);
   T before = shuffle_up(up_to, 1);
@@ -87,7 +87,7 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
-/// Lanes whose `bits` agree with this lane's in `mask`, a single bit. The compiler would need seven instructions.
+/// Lanes whose `bits` agree with this lane's in `mask`, a single bit. Fewer instructions than the compiler needs.
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
@@ -115,8 +115,8 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// The first k of [0, n) for which before(k) is false, if it is false from there on. For each group of kLanes lanes,
-/// which divides the range by kLanes + 1 in a step.
+/// The first k of [0, n) from which on before(k) is false. Each group of kLanes lanes searches for its own, and divides
+/// the range by kLanes + 1 in a step.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -130,7 +130,7 @@ template <int kLanes, class Before> __device__ int partition_point(int n, Before
   return found;
 }
 
-/// LaunchShape::shared_bytes of them.
+/// LaunchShape::shared_bytes bytes.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
   extern __shared__ float4 memory[];
@@ -140,15 +140,15 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes and returns the first number of a set. Number j < 32 is bit 31 - j: the lowest bit would take one more slow
-/// instruction to find.
+/// Removes and returns the first number of a set. Number j is bit 31 - j, which takes an instruction less to find than
+/// bit j.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
   return first;
 }
 
-/// Of what nobody reads soon.
+/// For numbers that are not read soon.
 __device__ inline void store_streaming(float4* to, const float4& value) {
 #if defined(__CUDA_ARCH__)
   __stcs(to, value);
@@ -157,15 +157,13 @@ __device__ inline void store_streaming(float4* to, const float4& value) {
 #endif
 }
 
-///
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)
   asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
 #endif
 }
 
-/// Begins to copy a number, or a quad past the cache of the multiprocessor, to shared memory: for all lanes to read
-/// after wait_for_copies(). T: float or float4.
+/// Begins to copy to shared memory; all lanes may read after wait_for_copies(). T: float or float4.
 template <class T> __device__ void copy_async(T* to, const T* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
@@ -178,7 +176,7 @@ template <class T> __device__ void copy_async(T* to, const T* from) {
   *to = *from;
 #endif
 }
-/// Rows of kWidth numbers, one for each of `lanes`. Neighbouring lanes copy neighbouring numbers.
+/// Rows [32, kWidth] of `lanes`. Neighbouring lanes copy neighbouring numbers.
 template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
@@ -193,11 +191,11 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-/// The compiler keeps no loads from before this in registers.
+/// The compiler loads again what it has loaded before this.
 __device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
 
-/// Sums N = 8, 9 or 10 values over the lanes, with 9 or 12 shuffles instead of 5 N: two lanes exchange halves of their
-/// values. Lane l gets the sum of value summed_value<N>(l).
+/// Sums 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes exchange halves of their values.
+/// Lane l gets the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();
@@ -219,7 +217,6 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 
-/// Lanes with the same value have the same bits.
 template <int N> __device__ int summed_value(int lane) {
   return N > 8 && lane & 2 ? (N > 9 && lane & 16 ? 9 : 8) : lane / 4;
 }

@@ -1,9 +1,7 @@
-// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, for a last group of up to 8,
-// of 8. A block per tile and group walks the whole list, with a pixel (or a sample of a Spread) per lane. It reads
-// lists, splats and rows of channels, and writes images, and for a backward pass transmittance and `last`.
-// blend_channels (channels/blend.cu) launches it: for footprints whose samples stay, with more than four channels; and
-// for reference footprints always, whose weights are slow anyway. Each group computes the weights again, which costs
-// less than to store them.
+// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8.
+// channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for reference
+// footprints always. A block per tile and group walks the whole list, and computes the weights again. It reads lists,
+// splats and rows of channels, and writes images, `transmittance` and `last`.
 #pragma once
 
 #include "cuda/dispatch.h"
@@ -13,39 +11,36 @@
 
 namespace ar::cuda {
 
-/// An eighth of the channels of a splat in a group of C.
 template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How the lanes of a warp share the C channels of its pixels. Each lane computes the weights of its own pixel. But
-/// sums over channels or pixels are shared out differently, so that a channel read from shared memory serves four
-/// pixels: a lane has a quarter of the channels of the four pixels in its column. Pixel i of lane l is the own pixel of
-/// lane l ^ 8 i (i = 0: of itself), and the lane has the eighths l / 4 and l / 4 ^ 1 of the channels.
+/// How the lanes of a warp share the C channels of its pixels. A lane computes the weights of its own pixel. But it
+/// sums a quarter of the channels of four pixels, which share a load from shared memory. Pixel i of lane l is the own
+/// pixel of lane l ^ 8 i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
   float v[kPixels][kOwn];
 
-  /// The lane whose own pixel is pixel i here.
+  /// The lane whose own pixel is pixel i.
   __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
-  /// The index in the group of this lane's channel k.
+  /// The index of this lane's channel k in the group.
   __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
 
-  /// From a number per lane, of its own pixel, to the numbers of this lane's pixels.
+  /// From own pixels of lanes to this lane's pixels.
   __device__ static void spread(float own, float (&of_pixels)[kPixels]) {
     of_pixels[0] = own;
 #pragma unroll
     for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
   }
-  /// This lane's channels of a splat.
   __device__ static void read(const Eighth<C> (&splat)[8], float (&own)[kOwn]) {
     const Eighth<C> first = splat[lane_id() / 4], second = splat[lane_id() / 4 ^ 1];
 #pragma unroll
     for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
   }
 
-  /// Adds a splat, of which `contribution` reaches this lane's own pixel.
+  /// `contribution`: of the splat to the own pixel.
   __device__ void add(float contribution, const Eighth<C> (&splat)[8]) {
     float contributions[kPixels], own[kOwn];
     spread(contribution, contributions);
@@ -56,23 +51,23 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Adds up the kLanes lanes that have the samples of a pixel. Each gets the sum.
+  /// Adds up the kLanes lanes of a pixel. Each gets the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
-    if constexpr (kLanes > 1) {  // four neighbours have the same channels
+    if constexpr (kLanes > 1) {  // four lanes with the same channels
       add_from_lane(1, 0);
       add_from_lane(2, 0);
     }
     if constexpr (kLanes == 16) {
-      add_from_lane(4, kHalf);  // the first eighth that this lane has is the second of that one
+      add_from_lane(4, kHalf);  // its eighths are in the other order
 #pragma unroll
-      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart are of the same pixel
+      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart
 #pragma unroll
         for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
       }
     }
   }
-  /// Adds the channels of the lane whose number differs by `offset`, beginning with its channel `first`.
+  /// Adds the channels of lane_id() ^ offset, from its channel `first` on, cyclically.
   __device__ void add_from_lane(int offset, int first) {
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
@@ -83,7 +78,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
     }
   }
-  /// The scalar product with one number per channel, for this lane's own pixel.
+  /// The scalar product with a number per channel, of the own pixel.
   __device__ float dot(const float (&own)[kOwn]) const {
     float parts[kPixels];
 #pragma unroll
@@ -92,7 +87,7 @@ template <int C> struct ChannelShare {
 #pragma unroll
       for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
     }
-    float sum = parts[0];  // over the four lanes that share a pixel
+    float sum = parts[0];
 #pragma unroll
     for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
     return sum;
@@ -102,8 +97,7 @@ template <int C> struct ChannelShare {
     read(splat, own);
     return dot(own);
   }
-  /// The sum over all pixels times their weights (`weight`: of this lane's own pixel). The lane gets the sum of channel
-  /// summed_channel(). Lanes trade halves of the channels; the first trade has no choice to make.
+  /// The sum over all pixels, times `weight` of the own pixel: of channel summed_channel() in this lane.
   __device__ float weighted_sum(float weight) const {
     static_assert(kOwn == 2 || kOwn == 8);
     float weights[kPixels], sums[kOwn];
@@ -130,19 +124,19 @@ template <int C> struct ChannelShare {
     }
     return sums[0];
   }
-  /// The channel whose sum this lane gets, and whether it is the first lane that gets it.
+  /// Of weighted_sum(): the channel of this lane, and whether it is the first lane with this channel.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
 
-/// Channels [first, first + C) of kBatch splats; zeros where there are fewer.
+/// Channels [first, first + C) of kBatch splats, then zeros.
 template <int kBatch, int C> struct GroupChannels {
   int32_t ids[kBatch];
   Eighth<C> values[kBatch][8];
 
-  /// A lane per channel. `reach` and `ids` of the first `count` rows must be known to all threads.
+  /// A lane per channel. `reach` and `ids` of `count` splats must be known to all threads.
   __device__ void load(const Channels<float>& channels, int first, int count, const uint8_t* reach) {
-    constexpr int kAhead = 4;  // loads before stores, so that they wait together
+    constexpr int kAhead = 4;  // loads that wait together
     constexpr int kRows = kBlendThreads / C;
     const int c = threadIdx.x % C;
     const bool used = first + c < channels.count;
@@ -165,7 +159,7 @@ template <int kBatch, int C> struct GroupChannels {
 template <class F, int C>
 inline constexpr int kGroupBlocks = blocks_per_sm(group_blocks(F::kSamples, C == kSmallGroup), kBlendThreads);
 
-/// Groups of C channels: block (tile, g) has the channels from first_group + g C on. `F`: what a lane blends.
+/// Block (tile, g) has channels [first_group + g C, first_group + (g + 1) C). F: what a lane blends.
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_kernel(const BlendParams params, int first_group) {
@@ -235,7 +229,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
-/// The parameters, with the three colours in the splats as rows of channels.
+/// With the colours in the splats as rows of channels.
 template <class Params> Params with_channels(Params p) {
   if (!p.channels.data) p.channels = {p.splats + kSplatColor, kSplatWidth, nullptr, 3};
   return p;

@@ -1,5 +1,4 @@
-// Launches the forward kernels of footprints whose samples stay, for up to four channels. dispatch.cu calls
-// blend_still().
+// Launches the forward kernels of footprints whose samples stay. dispatch.cu calls blend_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"
 #include "cuda/still/tail.cuh"
@@ -9,7 +8,7 @@ namespace {
 
 template <class F, int C, bool kKeep> void launch_kernels(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  const unsigned blocks = kBlocksPerSm * multiprocessors();  // of the tail, which share its work
+  const unsigned blocks = kBlocksPerSm * multiprocessors();  // share the tail
   const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);

@@ -1,19 +1,17 @@
-// Kernel blend_front: the forward pass of footprints whose samples stay at their nodes, for up to four channels. It
-// reads lists, splats and the plan (plan.cuh), and writes images, transmittance, `last` and checkpoints. blend_still
-// (still/blend.cu) launches it and the kernels of tail.cuh after it.
+// Kernel blend_front: the forward pass of footprints whose samples stay, for up to four channels. still/blend.cu
+// launches it, then the kernels of tail.cuh. They read lists, splats and the plan (plan.cuh), and write images,
+// checkpoints, `transmittance` and `last`.
 //
-// The list of a tile is cut into chunks: the first few are the front, the others the tail. Five kernels blend them:
+// The list of a tile is cut into chunks, the first of which are the front and the others the tail:
 //
-//   blend_front    a block per tile composites the chunks of the front in order, until all pixels have stopped. If some
-//                  are open after the front and pairs are left, the next kernels finish the tile
-//   tail_through   a block per chunk of the tail finds how much light the chunk alone lets through
-//   tail_scan      multiplies these numbers up to the transmittance at the begin of each chunk
-//   tail_blend     a block per chunk composites it, exactly as if the chunks before had just been composited
-//   tail_sum       adds up the chunks
+//   `blend_front`    composites the front, until all pixels have stopped. A block per tile.
+//   `tail_through`   finds how much light each chunk of the tail lets through, if pixels are open. A block per chunk.
+//   `tail_scan`      multiplies these numbers up to the transmittance at the begin of each chunk.
+//   `tail_blend`     composites each chunk from this transmittance on. A block per chunk.
+//   `tail_sum`       adds the chunks up.
 //
-// Chunks of the tail are blended side by side, so that a few tiles with long lists, as in small images of large scenes,
-// fill the device too. The picture has the same bits with and without a backward pass. For a backward pass (kKeep) a
-// checkpoint at the end of each chunk stores the transmittance and the channels of every sample.
+// So a few tiles with long lists, as in small images of large scenes, fill the device too. The picture has the same
+// bits with and without a backward pass.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -23,8 +21,8 @@
 
 namespace ar::cuda {
 
-/// A block per tile. `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kKeep`: stores what
-/// the backward pass needs.
+/// A block per tile. F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kKeep: for a backward
+/// pass.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(front_blocks(F::kSamples, F::kExpensive), kBlendThreads))
     blend_front_kernel(const BlendParams params) {
@@ -79,7 +77,7 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(front_blocks(F::k
       }
     }
   } else if constexpr (!kKeep) {
-    // The tail goes on from the last front chunk's checkpoint.
+    // The tail begins at the checkpoint of the last front chunk.
 #pragma unroll
     for (int s = 0; s < S; ++s) checkpoints.transmittance(front_length - 1, s) = state.transmittance[s];
     checkpoints.set_total(front_length - 1, total);

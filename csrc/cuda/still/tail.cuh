@@ -1,5 +1,6 @@
-// The four kernels that finish the tiles that blend_front has left open; front.cuh has an overview and launches them.
-// They read the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, then the images.
+// Kernels that finish the tiles that blend_front has left open; front.cuh has an overview, still/blend.cu launches
+// them. They read lists, splats, the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, `last` and
+// images.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,8 +10,7 @@
 
 namespace ar::cuda {
 
-/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks
-/// share them.
+/// Calls visit(chunk, list of its tile, end of the chunk in the list) for this block's tail chunks of open tiles.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -22,7 +22,7 @@ template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const
   }
 }
 
-/// Writes to the checkpoints what each tail chunk alone lets through, without a threshold at which to stop.
+/// Stores what each tail chunk alone lets through, without a threshold. F: what a lane blends.
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads,
                                   blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive), kBlendThreads))
@@ -50,9 +50,8 @@ __global__ void __launch_bounds__(kBlendThreads,
   });
 }
 
-/// A sample with less transmittance than this is stopped by the next splat that it meets, since alpha is at least
-/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of
-/// products of chunks, which differs from the rounding splat by splat.
+/// The next splat (alpha >= kAlphaMin) stops a sample with less transmittance than this, so the sample may count as
+/// stopped. The margin above kTransmittanceMin covers rounding, which differs between chunks and splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -60,12 +59,11 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
   return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
 }
 
-/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so
-/// that several multiprocessors read the checkpoints of a tile.
+/// Parts of 32 pixels, a block each: several multiprocessors read the checkpoints of a tile.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
-/// Blocks share the parts of the open tiles. `samples`: of a lane.
+/// Replaces what each chunk lets through by the transmittance at its begin, negative if the sample has stopped before.
+/// `samples`: of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = kTailLoads;
@@ -86,7 +84,7 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
       float through[kBatch];
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) through[k] = next[k];
-      load(first + kBatch);  // before the stores, after which loads would wait
+      load(first + kBatch);  // after stores it would wait
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
         if (first + k >= chunks) break;
@@ -98,8 +96,8 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
   }
 }
 
-/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample
-/// had stopped before the chunk.
+/// Stores the channels of each tail chunk and the transmittance at its end: zero if the sample had stopped before the
+/// chunk. F, C, kKeep: as in blend_front.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
     tail_blend_kernel(const BlendParams params) {
@@ -143,9 +141,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks
 
 inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
 
-/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum
-/// depends on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
-/// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
+/// Adds the chunks of open tiles up, and writes pixels. The order depends on the number of tail chunks alone, not on
+/// kKeep. Samples: LaneSamples of what a lane blends. C, kKeep: as in blend_front.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
@@ -168,7 +165,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     for (int s = 0; s < S; ++s) {
       const bool has_channels = kKeep || s == 0;
       Values<C> sum = {};
-      float last = 0;  // at the end of the last of these chunks that the sample reached
+      float last = 0;  // transmittance at the end of the last chunk that the sample reached
       for (int first = begin; first < end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];

@@ -1,12 +1,12 @@
-// Kernel of blend_vjp for footprints whose samples stay at their nodes, for up to four channels. blend_vjp_still
-// (still/blend_vjp.cu) launches it.
+// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. still/blend_vjp.cu
+// launches it. It reads the plan and what vjp_walk.cuh names, and writes rows of pair_grads.
 //
-// A warp has a chunk of a tile's list, and goes through it back to front with all pixels of the tile, eight per lane.
-// Each pair is summed in one place, so that no atomics are needed, whose order would change from run to run.
+// A warp goes through a chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp
+// makes the sums of a pair, without atomics, whose order would change from run to run.
 //
-//   vjp_pixels.cuh   the pixels of a lane, in registers or in shared memory
-//   vjp_sums.cuh     the splats that a warp has listed, and sums over its lanes
-//   vjp_walk.cuh     the chunk, the state of the pixels after it, and the way through its pairs
+//   vjp_pixels.cuh   pixels of a lane, in registers or in shared memory
+//   vjp_sums.cuh     listed splats, and sums over lanes
+//   vjp_walk.cuh     the chunk and the way through its pairs
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -15,7 +15,7 @@
 
 namespace ar::cuda {
 
-/// A chunk back to front over all pixels of its tile. `item`: its number in the plan's order.
+/// Walks chunk_order[item].
 template <class F, int C, bool kMeans>
 __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, SharedPixels<F, C>& shared,
                                                 VjpBatch<F, C>& batch) {
@@ -34,14 +34,13 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
   walk.run(tile_last);
 }
 
-/// What a block keeps in dynamic shared memory.
 template <class F, int C> struct VjpShared {
   SharedPixels<F, C> pixels[vjp_warps(F::kSamples)];
   VjpBatch<F, C> batches[vjp_warps(F::kSamples)];
 };
 
-/// `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kMeans`: with MeanSums or without.
-/// A warp takes the next chunk when it is done with one, and does not wait for the others of its block.
+/// F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kMeans: with MeanSums. Each warp claims
+/// chunks until none is left.
 template <class F, int C, bool kMeans>
 __global__ void __launch_bounds__(32 * vjp_warps(F::kSamples),
                                   blocks_per_sm(vjp_blocks(F::kSamples, F::kExpensive, C), 32 * vjp_warps(F::kSamples)))
