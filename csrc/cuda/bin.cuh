@@ -1,6 +1,6 @@
 // The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. count_depths counts splats,
-// pairs and digits of depth keys. After the sort by depth, emit_pairs and emit_long_pairs write a pair for each tile
-// that a splat touches. After the sort by tile, tile_offsets finds the first pair of each tile.
+// pairs and digits of depth keys. By depth, emit_pairs and emit_long_pairs write a pair for each tile of a splat. By
+// tile, tile_offsets finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>
@@ -26,8 +26,8 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
   return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
 }
 
-/// Hands out slots to a warp's kRows x 32 splats, and adds to counts.pairs. A lane has splats `stride` apart; `ranges`:
-/// of its first. All lanes must call it.
+/// Hands out slots to kRows x 32 splats of a warp, and counts them. `ranges`: of the lane's first splat; the next is
+/// `stride` later. All lanes must call it.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -47,7 +47,7 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
   }
 }
 
-/// Also sets memory of later kernels to zero. keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits]. counts: [1].
+/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits]. counts: [1].
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
@@ -103,7 +103,7 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
-/// Digits of the sort by tile: few, then short.
+/// Digits of the sort by tile: as few, then as short as the number of tiles allows.
 struct TileDigits {
   static constexpr int kMostBits = kTileDigitBits, kMostPasses = kTileDigits;
   int passes = 1, bits = kMostBits - 1;
@@ -122,12 +122,12 @@ struct TileDigits {
   }
 };
 
-/// Writes pairs, and counts the digits of their tiles for a block.
+/// Writes pairs of a block, and counts digits.
 class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
 
-  /// counts: [kMostCounts], shared. All threads must call it, and __syncthreads() before write().
+  /// counts: [kMostCounts] shared. All threads must call it, and __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
@@ -155,7 +155,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// A pair of a splat with few tiles: its lane, and a bit of its mask.
+/// The lane of a splat with few tiles, and a bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -167,7 +167,7 @@ struct MaskedPair {
 
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// Pairs of earlier blocks. status: [blocks], words as in sort.cuh. All lanes must call it.
+/// Pairs of earlier blocks. status: [blocks] as in sort.cuh. All lanes must call it.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -184,10 +184,10 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Indices in EmitParams::status: blocks that have begun; long splats; counts of blocks.
+/// In EmitParams::status: blocks that have begun; long splats; counts of blocks.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// Writes pairs in order of depth, those of a splat by rows of tiles. Long splats (tiles beyond 8x8) are only listed.
+/// In order of depth, then rows of tiles. Long splats (tiles beyond 8x8) are only listed.
 __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -225,8 +225,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // While earlier blocks count, tiles are listed in shared memory. Then neighbouring lanes write to neighbouring
-  // addresses.
+  // While earlier blocks count, tiles are listed in shared memory, for neighbouring lanes to write.
   const int warp = threadIdx.x / 32;
   int up_to[kEmitRows];  // listed, up to this lane
 #pragma unroll
@@ -289,7 +288,6 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   writer.finish();
 }
 
-/// Rows and columns of tiles, or of patches.
 struct BoxOfTiles {
   Range rows, columns;
 
@@ -299,7 +297,7 @@ struct BoxOfTiles {
   __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
 };
 
-/// Of a splat's bounding box, and a pixel more for rounding.
+/// With a pixel more for rounding.
 __device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGrid grid) {
   const auto range = [&](float middle, float half, int size) {
     return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
@@ -308,8 +306,7 @@ __device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGri
           range(support.mean.x, support.half_width + support.reach, grid.width)};
 }
 
-/// Writes the pairs of patches, if there is no room for those of tiles. Their slots are the splats. One block: slow but
-/// rare.
+/// Pairs of patches. One block: slow but rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
@@ -353,8 +350,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// A warp per long splat: the nearest splats are often long, and all in a few blocks of emit_pairs. Or one block, for
-/// the pairs of patches.
+/// A warp per long splat, which in emit_pairs would be in a few blocks; or one block for pairs of patches.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -393,7 +389,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   writer.finish();
 }
 
-/// Also reports the number of pairs to the host. tiles: [counts->listed]. counts: [1]. tile_offsets: [tile_count + 1].
+/// Reports the pairs to the host. tiles: [counts->listed]. counts: [1]. tile_offsets: [tile_count + 1].
 __global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {

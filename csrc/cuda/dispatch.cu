@@ -1,5 +1,5 @@
 // Entry points of blending for csrc/torch. blend() and blend_vjp() call the family of kernels that the table of
-// dispatch.h names. inspect() launches its kernel.
+// dispatch.h names.
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/launch.cuh"

@@ -31,11 +31,11 @@ namespace ar::cuda {
 
 enum class Family { kStill, kMoment, kChannels };
 
-/// log2 of the side of the tiles of a footprint F [px].
+/// log2 of the side of tiles [px].
 template <class F> constexpr int tile_bits_of(bool small_image) {
   return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
 }
-/// Calls visit with the side of the grid's tiles as a constant.
+/// Calls visit with the side of tiles as a constant.
 template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
   constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
   if constexpr (kLarge != kSmall) {
@@ -43,14 +43,14 @@ template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit
   }
   visit(std::integral_constant<int, kSmall>());
 }
-/// Calls f with what a lane blends of F in tiles of this grid: F, or F::Spread where a lane has one sample of a pixel.
+/// Calls f with what a lane blends of F in this grid: F, or one sample of it (F::Spread).
 template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
   with_tile_side<F>(grid, [&](auto side) {
     using OfLane = std::conditional_t<(side < kTile), typename F::Spread, F>;
     f(OfLane{});
   });
 }
-/// Calls f(PixelsOf<F>{}) for footprint F at index `footprint` of the registry: the type that kernels are compiled for.
+/// Calls f(PixelsOf<F>{}), which kernels are compiled for, of the footprint at this index of the registry.
 template <class Function> void visit_pixels(int footprint, Function&& f) {
   visit_footprint(footprint, Footprints{}, [&](auto chosen) { f(PixelsOf<decltype(chosen)>{}); });
 }
@@ -59,7 +59,7 @@ template <class F> constexpr Family family_of(int64_t channels) {
   if (F::kMoves) return Family::kMoment;
   return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
 }
-/// Calls f with what a lane blends of a footprint, if kFamily (still/ or channels/) has kernels for it.
+/// Calls f with what a lane blends of a footprint, if kFamily has kernels for it.
 template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {
   visit_pixels(footprint, [&](auto pixels) {
     using F = decltype(pixels);
@@ -67,18 +67,17 @@ template <Family kFamily, class Function> void visit_lanes(int footprint, TileGr
   });
 }
 
-/// How a footprint is blended.
 struct Route {
   Family family;
   int samples;          ///< of a pixel
   int samples_of_lane;  ///< 1 with F::Spread
   ListCut cut;
-  /// Kernels of the family, in the order of launches.
+  // Kernels of the family, in order of launches.
   std::array<const char*, 5> forward;
   std::array<const char*, 4> backward;
 };
 
-/// `footprint`: index in the registry; `capacity`: room for pairs.
+/// `capacity`: room for pairs.
 inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGrid grid, int multiprocessors) {
   Route route = {};
   visit_pixels(footprint, [&](auto f) {
@@ -109,7 +108,7 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
   return route;
 }
 
-/// Channels of the next group, where `left` channels are left.
+/// Channels of the next group; `left`: all that are left.
 template <class F> constexpr int group_width(int left) {
   return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }
@@ -119,7 +118,6 @@ inline int channel_group(int footprint, int left) {
   return width;
 }
 
-/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps.
 inline int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
   return int64_t(cut.max_segments) * (cut.segment / 32) * grid.side() * grid.side();
 }

@@ -1,11 +1,10 @@
-// Parameter structs of the CUDA stages, and the functions that launch the stages. csrc/torch (backend_cuda.cpp) fills
-// the structs; the .cu files launch. A struct adds to the one of its name in core/stages.h what only CUDA needs.
-// Pointers are views of device memory of the caller. Every function enqueues work on a stream; none waits for the
-// device.
+// Parameter structs of the CUDA stages, and the functions that launch the stages. torch/backend_cuda.cpp fills the
+// structs, the .cu files launch. A struct adds to its namesake in core/stages.h what only CUDA needs. Pointers are
+// device memory of the caller. No function waits for the device.
 //
-// Numbers that depend on the data stay on the device. The caller guesses the number of pairs and gives room for
-// `capacity` of them, at least one per splat. If there are more pairs, neighbouring tiles (a patch) share one list, and
-// blending tests its splats against each tile. That is slower, gives the same result, and the host need not wait.
+// Only the device knows the number of pairs. The caller gives room for `capacity` pairs, at least one per splat. If
+// there are more, neighbouring tiles (a patch) share a list, and blending tests its splats against each tile: slower,
+// with the same result.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -18,50 +17,47 @@
 
 namespace ar::cuda {
 
-/// Numbers of a row of pair_grads: PairGrad (6), three channels, MeanSums (2), a fourth channel.
+/// A row of pair_grads: PairGrad (6), three channels, MeanSums (2), a fourth channel.
 inline constexpr int kPairGradWidth = 12;
 inline constexpr int kPairChannels = 6, kPairMeans = 9, kPairFourthChannel = 11;  ///< columns
-/// Up to so many channels are blended at once and summed in pair_grads. More channels are blended in groups, and summed
-/// in channel_sums.
+/// More channels are blended in groups, and summed in channel_sums.
 inline constexpr int kFewChannels = 4;
-/// Channels of a group, and of a last group where no more are left.
+/// Channels of a group, and of a last group.
 inline constexpr int kChannelGroup = 32, kSmallGroup = 8;
 
-/// Bits of a digit, and digits, of the sort by depth.
+/// Bits of a digit, and digits.
 inline constexpr int kDepthBits = 9, kDepthPasses = 4;
 inline constexpr int kDepthHistogramWords = kDepthPasses << kDepthBits;
 
-/// Depth keys of splats without pairs: after all others.
+/// Of splats without pairs.
 inline constexpr uint32_t kCulledKey = 0xffffffff;
-/// A depth key is the bits of the depth plus this number. So bits 27 to 31 are the same for all depths from 1/8 to less
-/// than 8192, and the last pass of the sort has nothing to do.
+/// Added to the bits of a depth: then bits 27 to 31 agree for depths from 1/8 to 8192, and the last pass of the sort
+/// has nothing to do.
 inline constexpr uint32_t kDepthKeyOffset = 0x02000000;
 
-/// The slots of a splat: rows of pair_grads, one per pair. Slots of 32 splats that are neighbours in memory are
-/// adjacent, because a warp of project_vjp reads them together.
+/// The slots of a splat: rows of pair_grads, one per pair. Slots of 32 neighbouring splats are adjacent, because a warp
+/// reads them together.
 struct PairRange {
   int32_t first, count;
 };
 
-/// Lists of more tiles are written by a whole warp.
+/// A whole warp writes the pairs of more tiles.
 inline constexpr int kManyTiles = 16;
-/// The tiles that a splat touches. In one struct, because bin reads them in random order.
+/// The tiles of a splat. One struct, because bin reads it in random order.
 struct alignas(16) SplatTiles {
-  TileMask mask;  ///< 8x8 tiles from tile `first` on; 0: the splat has tiles beyond them
+  TileMask mask;  ///< of 8x8 tiles from `first` on; 0: there are others
   int32_t first, count;
 };
 
-/// A pair in the list of a tile: a splat, and the slot of the pair. In the list of a patch the slot is the splat
-/// itself, to whose row all tiles add.
+/// A pair in the list of a tile. In the list of a patch the slot is the splat, to whose row all tiles add.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
-/// Numbers of a SegmentMap (moment/maps.cuh).
+/// Of a SegmentMap (moment/maps.cuh).
 inline constexpr int kMapNumbers = 10;
 
-/// moment/: pairs between two checkpoints, and the planes of a checkpoint, [side, side] each: transmittance and
-/// position of every sample.
+/// moment/: pairs between checkpoints, and planes of a checkpoint: transmittance and position of every sample.
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
@@ -69,10 +65,9 @@ AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 struct alignas(8) Counts {
   int64_t pairs;
   int64_t splats;      ///< with pairs
-  int64_t listed;      ///< pairs that are written: of tiles, or of patches
-  int64_t patch_bits;  ///< a patch has 2^patch_bits x 2^patch_bits tiles; the first begins with tile 0
+  int64_t listed;      ///< pairs that are written, of tiles or patches
+  int64_t patch_bits;  ///< a patch has 2^patch_bits tiles on a side
 
-  /// Whether there are patches: no room for all pairs.
   AR_HD bool in_patches(int64_t capacity) const { return pairs > capacity; }
 };
 
@@ -81,7 +76,7 @@ struct BinInput {
   uint32_t* keys;              ///< [n] depth keys
   PairRange* ranges;           ///< [n] only the counts
   SplatTiles* tiles;           ///< [n] only of splats with pairs
-  Counts* counts;              ///< [1] set to zero, as are the histograms
+  Counts* counts;              ///< [1] zeros, as are the histograms
   uint32_t* depth_histograms;  ///< [kDepthPasses, 2^kDepthBits]
 };
 
@@ -97,9 +92,9 @@ struct ProjectRowsParams {
   Gaussians<float> gaussians;
   FootprintChoice footprint;
   CullBounds<float> bounds;
-  ProjectedRows<float> rows;  ///< [n] written where the radius is not 0; or all null
+  ProjectedRows<float> rows;  ///< [n] if the radius is not 0; or null
   int32_t* radii;             ///< [n]
-  PackedRows<float> packed;   ///< written instead of rows and radii, if not null
+  PackedRows<float> packed;   ///< instead of rows and radii, or null
 };
 
 /// From public rows to splats.
@@ -112,40 +107,41 @@ struct EmitParams {
   int footprint;  ///< index in the registry
   TileGrid grid;
   int64_t capacity;               ///< >= counts->splats
-  Counts* counts;                 ///< [1] listed and patch_bits are written
+  Counts* counts;                 ///< [1] sets listed and patch_bits
   const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
-  const PairRange* ranges;        ///< [n] read if there are slot_pairs
+  const PairRange* ranges;        ///< [n]
+
   // Scratch. Long splats have tiles beyond 8x8.
   int32_t* long_splats;   ///< [n] in any order
-  int32_t* long_places;   ///< [n] index of the first pair of each
-  uint32_t* status;       ///< [emit_scratch(n) bytes] zero at first
-  uint32_t* tile_counts;  ///< [tile_sort_scratch() bytes] zero at first; digits of tiles are counted for sort_by_tile
-  // Output.
-  uint32_t* tiles;       ///< [capacity] tile of each pair, or first tile of its patch
-  int32_t* splat_pairs;  ///< [capacity] without a backward pass, else null
-  SlotPair* slot_pairs;  ///< [capacity] with a backward pass, else null
+  int32_t* long_places;   ///< [n] first pair of each
+  uint32_t* status;       ///< [emit_scratch() bytes] zeros
+  uint32_t* tile_counts;  ///< [tile_sort_scratch() bytes] zeros; gets counts of digits
+
+  uint32_t* tiles;       ///< [capacity] of each pair; of a patch the first tile
+  int32_t* splat_pairs;  ///< [capacity] or null
+  SlotPair* slot_pairs;  ///< [capacity] for a backward pass, or null
 };
 
 /// The lists that blending walks.
 struct TileLists {
-  const int32_t* pairs;         ///< [capacity, stride] splats (and slots) by tile, then depth
+  const int32_t* pairs;         ///< [capacity, stride] splats (and slots) by tile, depth
   int stride;                   ///< 1, or 2 with slots
   const int64_t* tile_offsets;  ///< [tiles + 1] a patch has the list of its first tile
   const Counts* counts;         ///< [1]
   int64_t n, capacity;          ///< splats; room for pairs
 };
 
-/// From lists to images, state for the backward pass, and checkpoints.
+/// From lists to images and checkpoints.
 struct BlendParams : ar::BlendParams<float> {
   TileLists lists;
   ChunkPlan plan;
   ListCut cut;
-  int32_t* tile_open;       ///< [tiles] still/: whether the front left samples open
+  int32_t* tile_open;       ///< [tiles] still/: the front has left samples open
   int32_t* open_tiles;      ///< [tiles] still/: these tiles
   CheckpointLayout layout;  ///< still/
   float* checkpoints;       ///< still/: [planes, kTile^2]; moment/: [checkpoints, state_planes(), side^2]
-  uint32_t* reach_words;    ///< [max_reach_words()] moment/, or null where no list may be cut
+  uint32_t* reach_words;    ///< [max_reach_words()] moment/, or null
 };
 
 /// From lists to statistics of pixels and Gaussians.
@@ -153,8 +149,7 @@ struct InspectParams : ar::InspectParams<float> {
   TileLists lists;
 };
 
-/// From the gradient of the images to sums of pairs. If the three colours are in the splats, dL_dimage.first is not
-/// null.
+/// From gradients of images to sums of pairs. Without channels.data dL_dimage.first is not null.
 struct BlendVjpParams : ar::BlendVjpParams<float> {
   TileLists lists;
   const TileChunk* chunk_order;  ///< as in ChunkPlan
@@ -162,31 +157,31 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const PlanState* plan;
   ListCut cut;
   int64_t max_chunks;
-  int32_t* chunks_taken;  ///< [1] chunks that warps have claimed; set to zero by blend_vjp
-  float* checkpoints;     ///< as in BlendParams; moment/ writes those of lists that are cut
-  float* pair_grads;      ///< [max(capacity, n), kPairGradWidth] a row per slot; per splat if lists are of patches
-  float* channel_sums;    ///< [max(capacity, n), channel_group()] the same for groups of channels, or null
+  int32_t* chunks_taken;  ///< [1] chunks that warps have claimed
+  float* checkpoints;     ///< as in BlendParams; moment/ adds those of cut lists
+  float* pair_grads;      ///< [rows, kPairGradWidth] a row per slot, max(capacity, n) in all; of patches per splat
+  float* channel_sums;    ///< [rows, channel_group()] or null
   MeanSums mean_sums;
   float* adjoint_maps;  ///< [max_adjoint_maps()] moment/
   float* group_sums;    ///< [max_group_sums()] moment/
 };
 
-/// The pairs of every splat, to be summed.
+/// The pairs of every splat.
 struct PairSumsView {
   int64_t n;
   const PairRange* ranges;  ///< [n]
   const Counts* counts;     ///< [1]
   int64_t capacity;
-  const float* pair_grads;  ///< [max(capacity, n), kPairGradWidth]
+  const float* pair_grads;  ///< [rows, kPairGradWidth]
 
-  /// Whether pair_grads has a row per splat, because lists are of patches.
+  /// Whether rows are of splats, not of slots.
   AR_HD bool by_splat() const { return counts->in_patches(capacity); }
 };
 
-/// From sums of pairs to gradients with respect to channels [first, first + count) of every splat.
+/// From sums of pairs to gradients of channels [first, first + count) of every splat.
 struct SumChannelsParams {
   PairSumsView sums;
-  const float* channel_sums;  ///< [max(capacity, n), width]; null: the channels are columns of pair_grads
+  const float* channel_sums;  ///< [rows, width]; null: columns of pair_grads
   int width;                  ///< kChannelGroup or kSmallGroup
   int first, count;
   float* dL_dchannels;  ///< [n, stride]
@@ -196,8 +191,8 @@ struct SumChannelsParams {
 /// From sums of pairs to gradients of Gaussians.
 struct ProjectVjpParams : ar::ProjectVjpParams<float> {
   PairSumsView sums;
-  bool channels_in_pairs;  ///< dL_dchannels has no rows: the gradients of its columns are in pair_grads
-  float* camera_grads;     ///< [warps_of(n), kCameraGradWidth] a CameraGrad of each 32 Gaussians, or null
+  bool channels_in_pairs;  ///< gradients of dL_dchannels are columns of pair_grads
+  float* camera_grads;     ///< [warps_of(n), kCameraGradWidth] of 32 Gaussians, or null
 };
 
 /// Zeros for Gaussians that project_vjp leaves out.
@@ -213,7 +208,7 @@ struct ProjectRowsVjpParams {
   Gaussians<float> gaussians;
   GaussianGrads<float> grads;
   ProjectedRowGrads<float> rows;
-  bool add;             ///< add to `grads` instead of overwriting them
+  bool add;             ///< adds to `grads`
   float* camera_grads;  ///< as in ProjectVjpParams
 };
 
@@ -228,7 +223,7 @@ AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 void project(const ProjectParams& p, cudaStream_t stream);
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
-/// Leaves out groups of 32 Gaussians without a single pair: zero_culled_grads writes their gradients.
+/// Leaves groups of 32 Gaussians without pairs to zero_culled_grads.
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
 /// `begun`: as in LaunchShape.
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
@@ -236,16 +231,16 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 
-// Blending (dispatch.cu). `footprint` is an index in the registry; dispatch.h has the sizes of arrays. Without
-// p.channels.data the three colours in the splats are blended.
+// Blending (dispatch.cu). `footprint`: index in the registry. Without p.channels.data the colours in the splats are
+// blended.
 void blend(int footprint, const BlendParams& p, cudaStream_t stream);
-/// Of the group of channels from `first` on; 0 for up to kFewChannels.
+/// The group of channels from `first` on.
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
 /// Of the current device, for route_of().
 int multiprocessors_of_device();
 int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid);
-// The families (still/blend.cu, still/blend_vjp.cu and so on).
+// The families (still/, moment/, channels/).
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);
 void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
@@ -261,14 +256,13 @@ void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t strea
 
 // Binning (bin.cu).
 
-/// Most splats, and most pairs, that can be sorted: 2^30 - 1.
+/// Most splats or pairs that can be sorted.
 int64_t max_items();
 
-/// Bytes of scratch memory, multiples of 16. The histograms come first in that of the sort by depth.
+/// Bytes of scratch memory, multiples of 16. That of the sort by depth begins with histograms.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
-/// Threads of a block of emit_pairs, and splats of a thread. Each block waits for the block before it, so that fewer
-/// blocks are faster.
+/// Threads of a block of emit_pairs, and splats of a thread: few blocks, because each waits for the one before.
 inline constexpr int kEmitThreads = 256, kEmitRows = 2, kEmitSplats = kEmitThreads * kEmitRows;
 inline int64_t emit_scratch(int64_t n) {
   return ((2 + (n + kEmitSplats - 1) / kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
@@ -280,28 +274,27 @@ struct DepthSort {
   uint32_t* keys[2];  ///< [n] both are overwritten
   int32_t* order[2];  ///< [n]
   PairRange* ranges;  ///< [n]
-  bool with_slots;    ///< count_depths hands out slots, in an order that differs from run to run
+  bool with_slots;    ///< hand out slots; the order differs from run to run
   Counts* counts;     ///< [1]
 };
-/// Memory to set to zero: aligned to 16 bytes, and a multiple of them.
+/// To set to zero, in pieces of 16 bytes.
 struct ZeroedMemory {
   void* data;
   int64_t bytes;
 };
-/// Comes first, once: counts pairs and digits of keys, hands out slots, and sets `rest` of `scratch` and `of_tiles` to
-/// zero.
+/// Comes first: counts pairs and digits of keys, hands out slots, and sets `rest` of `scratch` and `of_tiles` to zero.
 void count_depths(const DepthSort& p, void* scratch, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream);
 void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);
 
-/// Where the device reports the number of pairs of a frame: memory of the host (pair_guess.h).
+/// Where the device reports the number of pairs (pair_guess.h).
 struct PairFeedback {
-  uint64_t* word;
+  uint64_t* word;  ///< of the host
   uint32_t frame;
 };
 
-/// Sorts what emit_pairs wrote by tile, stably. The result is values[tile_sort_result(grid)].
+/// Sorts pairs by tile, stably. The result is values[tile_sort_result(grid)].
 template <class Value> struct TileSort {
   int64_t capacity;
   const Counts* counts;   ///< [1]
@@ -315,7 +308,6 @@ int tile_sort_result(TileGrid grid);
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 
-/// `layout`: of the checkpoints of still/.
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream);
 

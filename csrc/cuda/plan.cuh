@@ -1,5 +1,5 @@
-// The two kernels of plan_chunks; bin.cu launches them. count_work counts tiles and chunks by length. plan cuts the
-// lists into chunks and writes the ChunkPlan (chunk_plan.h).
+// The kernels of plan_chunks; bin.cu launches them. count_work counts tiles and chunks by length. plan writes the
+// ChunkPlan (chunk_plan.h).
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -12,11 +12,10 @@ inline constexpr int kCountWorkThreads = 1024, kPlanThreads = 256;
 /// Tiles of a thread whose loads wait together.
 inline constexpr int kTilesAtOnce = 2;
 
-/// The class of a piece of work by its length; a power of two longer is a class lower. Work begins in order of classes,
-/// so that no block starts on a long piece when others are done. The order in a class is arbitrary.
+/// The class of a piece of work: longer work has a lower class, and begins first. The order in a class is arbitrary.
 __device__ inline int work_class(int length) { return __clz(length); }
 
-/// The next index in class `of`, if `wanted`. One atomic per class of a warp. All lanes must call it.
+/// The next index in class `of`, if `wanted`, with an atomic per class of a warp. All lanes must call it.
 __device__ inline int take_place(int32_t* next, int of, bool wanted) {
   const uint32_t peers = __match_any_sync(kAllLanes, wanted ? of : -1);
   const int leader = __ffs(int(peers)) - 1;
@@ -36,14 +35,14 @@ struct PlannedTile {
     is_long = cut.max_segments > 0 && !in_patches && n >= cut.long_from(lists.counts->pairs);
     length = is_long ? cut.segment : cut.whole ? kWholeList : kChunkLength;
   }
-  /// Chunks, with the last segment of a long list.
+  /// Full chunks, and the last segment of a long list.
   __device__ int full() const { return (is_long ? n + length - 1 : n) / length; }
   __device__ int rest() const { return is_long ? 0 : n % length; }
-  /// Of full chunks. Segments have the class of their list, to stay in its order.
+  /// Segments have the class of their list.
   __device__ int full_class() const { return work_class(is_long ? n : length); }
 };
 
-/// Each block counts a part of the tiles, in state->counted[blockIdx.x]. state: [1].
+/// Each block counts a part of the tiles. state: [1].
 __global__ void __launch_bounds__(kCountWorkThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
@@ -77,7 +76,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   if (c == 0) counts.planes = counts.tail = counts.open_tiles = 0;
 }
 
-/// The size of class threadIdx.x; `of` chooses tiles or chunks.
+/// Of class threadIdx.x; `of` chooses tiles or chunks.
 template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
   static_assert(kLengthClasses < kPlanThreads);
   const int c = threadIdx.x;
@@ -87,18 +86,18 @@ template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of
   return size;
 }
 
-/// The lists that are cut: classes of long lists, longest first, up to the limit of segments.
+/// Which lists are cut: classes of long lists, longest first, up to the limit of segments.
 struct CutClasses {
   int lists = 0, segments = 0, longest = 0;
-  int chunks_of_class;  ///< of this thread's class; a chunk per list if they are long but not cut
+  int chunks_of_class;  ///< of this thread's class
 
-  /// `lists_of_class`, `counted` (chunks): of this thread's class. All threads must call it.
+  /// lists_of_class, counted: of this thread's class. All threads must call it.
   __device__ CutClasses(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || tile_lists.counts->in_patches(tile_lists.capacity)) return;
     constexpr int kWarps = kPlanThreads / 32;
-    const int of_length = threadIdx.x;  // of threads beyond the classes both sizes are 0
+    const int of_length = threadIdx.x;  // beyond the classes both sizes are 0
     const bool are_long = of_length <= __clz(cut.long_from(pairs));
     int all;
     const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
@@ -110,8 +109,8 @@ struct CutClasses {
   }
 };
 
-/// Writes where each class begins, in shared memory, from the size of this thread's class. Returns the size of all
-/// classes. All threads must call it, and then __syncthreads().
+/// Where each class begins, in shared memory. `size`: of this thread's class. Returns the size of all. All threads must
+/// call it, then __syncthreads().
 __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   const int c = threadIdx.x;
   int all;
@@ -120,12 +119,12 @@ __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   return all;
 }
 
-/// Chunks [begin, end) of a tile, at index `place` of a list of chunks.
+/// Chunks [begin, end) of a tile, at index `place` of a list.
 struct ChunkRun {
   int place, begin, end;
 };
-/// Writes the run of each lane. `first`: what chunk 0 would be. `of_chunk`: planes of a chunk. A warp writes long runs
-/// together. All lanes must call it.
+/// Writes the run of each lane; a warp writes long runs together. `first`: what chunk 0 would be. `of_chunk`: planes of
+/// a chunk. All lanes must call it.
 __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const TileChunk& first, int of_chunk) {
   constexpr int kMany = 4;
   const bool many = run.end - run.begin > kMany;
@@ -139,7 +138,7 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
   }
 }
 
-/// A thread per tile. Atomics hand out indices: the order differs from run to run, and changes no result.
+/// A thread per tile. Atomics hand out indices, whose order changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {

@@ -1,7 +1,6 @@
-// The kernels of the backward pass after blend_vjp; project.cu launches them. project_vjp reads gradients of pairs, or
-// of public rows (perhaps on another rank), and writes gradients of Gaussians. zero_culled_grads writes zeros for
-// Gaussians without pairs, beside blend_vjp. row_grads sums pairs into gradients of public rows, and sum_channels into
-// gradients of channels.
+// Kernels of the backward pass after blend_vjp; project.cu launches them. They read sums of pairs. project_vjp writes
+// gradients of Gaussians, also from gradients of public rows. Beside blend_vjp zero_culled_grads writes zeros for
+// Gaussians without pairs. row_grads writes gradients of public rows, and sum_channels of channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,7 +8,7 @@
 
 namespace ar::cuda {
 
-/// Adjacent Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
+/// Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
 inline constexpr int kGradRows = 32;
 static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
@@ -20,7 +19,7 @@ __device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(i
 struct SplatSums {
   float value[kPairGradWidth];
 
-  /// Adds up to kRows rows [count, kPairGradWidth], loaded at once.
+  /// Adds up to kRows rows [count, kPairGradWidth].
   template <int kRows> __device__ void add(const float* rows, int count) {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
@@ -46,7 +45,7 @@ struct SplatSums {
   }
 };
 
-/// Sums the pairs of each lane's splat i, in a fixed order. All lanes must call it.
+/// Of splat i of each lane, in a fixed order. All lanes must call it.
 __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
   SplatSums sums = {};
   const auto row = [&](int64_t k) { return pairs.pair_grads + k * kPairGradWidth; };
@@ -90,16 +89,16 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
-/// `rows` as a view that begins with index `first`.
+/// A view that begins with index `first`.
 template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
 
-/// Gaussians of a warp in shared memory, without colours.
+/// In shared memory, without colours.
 struct GaussianRows {
   float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
-  /// Begins to load Gaussians first + k of lanes k. Returns views, to read after wait_for_copies().
+  /// Begins to load Gaussian first + k for lane k. Returns views, to read after wait_for_copies().
   __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
@@ -120,17 +119,15 @@ struct GaussianRows {
   }
 };
 
-/// project_vjp from sums of pairs.
+/// A source of project_vjp.
 struct FromPairs {
   using Params = ProjectVjpParams;
   static constexpr bool kZeroed = true;  ///< by zero_culled_grads
   const ProjectVjpParams& params;
 
-  /// Count 0: no gradient.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// All lanes must call it.
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
-  /// Calls use(function from splat to gradient, ShownGrad, MeanSums).
+  /// Calls use(function from splat to gradient, ShownGrad, sums).
   template <class Cam, class Use>
   __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, const SplatSums& sums,
                         Use&& use) const {
@@ -153,7 +150,7 @@ struct FromPairs {
   }
 };
 
-/// project_vjp from gradients of public rows.
+/// A source of project_vjp: gradients of public rows.
 struct FromRows {
   using Params = ProjectRowsVjpParams;
   static constexpr bool kZeroed = false;
@@ -174,7 +171,7 @@ struct FromRows {
   }
 };
 
-/// Adds gradients to arrays; those of coefficients are made in shared memory first.
+/// Adds gradients, of coefficients by way of shared memory.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
   __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
@@ -239,7 +236,6 @@ __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kF
   }
 }
 
-/// A warp has several groups.
 __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
@@ -249,7 +245,7 @@ __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZero
   int count = count_of(first + lane_id());
   for (; first < n; first += step) {
     const uint32_t lit = lanes_with_pairs(count);
-    count = count_of(first + step + lane_id());  // of the next group, to arrive during the stores
+    count = count_of(first + step + lane_id());  // of the next group
     if (lit == 0) zero_grads_of_warp(params.gaussians, params.grads, first, rows_of_group(first, n));
   }
 }
@@ -271,7 +267,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
     dL_dcov = cov_grad(cov, grad.splat);
     dL_dopacity = grad.weighted / params.opacity(i);
   }
-  if (params.packed) {  // neighbouring threads at neighbouring addresses
+  if (params.packed) {
     const int width = params.packed_width;
     write_packed_grad(packed_rows + threadIdx.x * width, width, dL_dmean, {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy},
                       dL_dopacity, sums.color(), sums.mean_sums());
@@ -288,7 +284,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
-/// From columns of pair_grads. A thread per splat.
+/// A thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
@@ -302,8 +298,7 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// From channel_sums [max(capacity, n), C]. A splat has kSumLanes lanes, or the block if it has many pairs. A lane has
-/// four channels.
+/// channel_sums: [rows, C]. A splat has kSumLanes lanes, or with many pairs the block. A lane has four channels.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
@@ -316,7 +311,6 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
   const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
-  // Rows `row`, `row` + step, ...
   const auto sum_rows = [&](const PairRange& of_splat, int row, int step) {
     const auto* quads = reinterpret_cast<const float4*>(params.channel_sums) + int64_t(of_splat.first) * kQuads + quad;
     float4 sum = {0, 0, 0, 0};
@@ -332,7 +326,6 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
     }
     return sum;
   };
-  // Over `lanes` adjacent lanes.
   const auto sum_lanes = [&](float4& sum, int lanes) {
     for (int offset = kQuads; offset < lanes; offset *= 2) {
       add(sum, {__shfl_xor_sync(kAllLanes, sum.x, offset), __shfl_xor_sync(kAllLanes, sum.y, offset),

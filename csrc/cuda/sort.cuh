@@ -1,6 +1,5 @@
-// A library for bin.cu and bin.cuh: the kernel of a pass of a stable radix sort, for a number of items that only the
-// device knows. It is "Onesweep" of Adinets and Merrill (2022): one histogram for all digits, then a pass per digit, in
-// which a block adds up what earlier blocks have published.
+// A library for bin.cu and bin.cuh: a pass of a stable radix sort, where only the device knows the number of items. It
+// is "Onesweep" of Adinets and Merrill (2022): a block adds up what earlier blocks have published.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -18,7 +17,7 @@ template <int kBits> struct Digits : SortTuning<kBits> {
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
 };
 
-/// The key of no item, left out by the first pass.
+/// The key of no item.
 inline constexpr uint32_t kNoKey = 0xffffffff;
 
 // A block publishes a count, and whether it includes all earlier blocks. Zero: nothing yet.
@@ -61,7 +60,7 @@ template <int kBits> struct SortScratch {
         blocks(blocks_of(capacity)) {}
 };
 
-/// Counts kPasses digits of a warp's keys. histograms: [kPasses, kBins]. All lanes must call it.
+/// histograms: [kPasses, kBins]. All lanes must call it.
 template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
   constexpr int kBins = Digits<kBits>::kBins;
   if (!__any_sync(kAllLanes, valid)) return;
@@ -79,7 +78,7 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
   }
 }
 
-/// Items of earlier blocks with a digit. `status`: the word of this block; the block before is `width` words before.
+/// Items of earlier blocks. `status`: of this block; the block before is `width` words before.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
   if (block == 0) return 0;
   uint32_t sum = 0;
@@ -107,15 +106,14 @@ template <int kBits, class Value> struct SortShared {
     uint32_t counts[D::kWarps][D::kBins];  ///< at first
     Sorted sorted;                         ///< then, in the order of this pass
   };
-  uint16_t next[D::kWarps][D::kBins];  ///< of a warp's next item, in the block
-  uint32_t to_global[D::kBins];        ///< from position in the block to position
+  uint16_t next[D::kWarps][D::kBins];  ///< position in the block of a warp's next item
+  uint32_t to_global[D::kBins];        ///< from position in the block
   uint32_t block;
 };
 
-/// Sorts *count items by digit `pass`. kBits: of a digit. Value: int32_t or SlotPair. kFirst: values are indices, and
-/// keys kNoKey are left out. Arrays: [*count]; keys_in with kFirst: [capacity]. keys_out may be null.
-/// may_skip: the last pass ends at once if all items have one digit. Earlier passes then exchange values_in and
-/// values_out, so that the result is where it should be.
+/// Sorts *count items by digit `pass` of kBits bits. Value: int32_t or SlotPair. kFirst: values are indices, and kNoKey
+/// is left out. Arrays: [*count]; with kFirst keys_in: [capacity]. keys_out may be null. may_skip: the last pass ends
+/// at once if all items have one digit; earlier passes exchange values_in and values_out for it.
 template <int kBits, class Value, bool kFirst>
 __global__ void __launch_bounds__(Digits<kBits>::kThreads,
                                   blocks_per_sm(Digits<kBits>::kBlocks, Digits<kBits>::kThreads))
@@ -150,7 +148,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {
-    // Later passes count keys past the end too, which come last.
+    // Later passes count keys past the end, which come last.
     if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
   Value values[kItems];
@@ -210,7 +208,6 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   }
   __syncthreads();
 
-  // Neighbouring threads write to neighbouring addresses.
   const uint32_t here = kFirst ? uint32_t(all) : uint32_t(min(n - begin, int64_t(D::kTile)));
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {

@@ -1,5 +1,5 @@
-// A library for all kernels. Sums, votes and searches over the lanes of a warp, which all lanes must call; loads,
-// stores and copies, which single lanes may call.
+// A library for all kernels: sums, votes and searches over a warp, which all lanes must call; and loads, stores and
+// copies of single lanes.
 #pragma once
 
 #include <cstdint>
@@ -20,7 +20,7 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
-/// The sum over this lane and lane_id() ^ offset: of y, if this is the upper lane, else of x.
+/// Over this lane and lane_id() ^ offset: the sum of y in the upper lane, of x in the lower.
 __device__ inline float sum_of_pair(const float& x, const float& y, bool upper, int offset) {
   const float keep = upper ? y : x, give = upper ? x : y;
   return keep + __shfl_xor_sync(kAllLanes, give, offset);
@@ -34,7 +34,7 @@ __device__ inline float warp_sum_of_two(float x, float y) {
   return sum;
 }
 
-/// Up to this lane. T has shuffle(), shuffle_up() and a +, which need not commute.
+/// T has shuffle(), shuffle_up() and a +, which need not commute.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
 #pragma unroll
   for (int offset = 1; offset < 32; offset *= 2) {
@@ -44,7 +44,7 @@ template <typename T> __device__ T warp_inclusive_sum(T v) {
   return v;
 }
 
-/// Over the threads before this one in a block of kWarps warps; with kWarps = 1 in a warp. `all`: over all threads.
+/// Over the threads before this one, of a block of kWarps warps or of a warp (1). `all`: over all threads.
 template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all) {
   const T up_to = warp_inclusive_sum(own);
   T before = shuffle_up(up_to, 1);
@@ -87,7 +87,7 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
-/// Lanes whose `bits` agree with this lane's in `mask`, a single bit. Fewer instructions than the compiler needs.
+/// Lanes whose `bits` agree with this lane's in `mask`, one bit.
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
@@ -115,8 +115,7 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// The first k of [0, n) from which on before(k) is false. Each group of kLanes lanes searches for its own, and divides
-/// the range by kLanes + 1 in a step.
+/// The first k of [0, n) from which on before(k) is false, for each group of kLanes lanes.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -130,7 +129,7 @@ template <int kLanes, class Before> __device__ int partition_point(int n, Before
   return found;
 }
 
-/// LaunchShape::shared_bytes bytes.
+/// LaunchShape::shared_bytes.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
   extern __shared__ float4 memory[];
@@ -140,8 +139,7 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes and returns the first number of a set. Number j is bit 31 - j, which takes an instruction less to find than
-/// bit j.
+/// Removes and returns the first number of a set. Number j is bit 31 - j, which is found faster than bit j.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
@@ -163,7 +161,7 @@ __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #endif
 }
 
-/// Begins to copy to shared memory; all lanes may read after wait_for_copies(). T: float or float4.
+/// To shared memory, to be read after wait_for_copies(). T: float or float4.
 template <class T> __device__ void copy_async(T* to, const T* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
@@ -176,7 +174,7 @@ template <class T> __device__ void copy_async(T* to, const T* from) {
   *to = *from;
 #endif
 }
-/// Rows [32, kWidth] of `lanes`. Neighbouring lanes copy neighbouring numbers.
+/// Rows [32, kWidth] of `lanes`.
 template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
@@ -194,8 +192,8 @@ __device__ inline void wait_for_copies() {
 /// The compiler loads again what it has loaded before this.
 __device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
 
-/// Sums 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes exchange halves of their values.
-/// Lane l gets the sum of value summed_value<N>(l).
+/// Sums 8, 9 or 10 values with 9 or 12 shuffles instead of 5 N, as lanes exchange halves of their values. Lane l gets
+/// the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();

@@ -1,7 +1,7 @@
 // Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8.
 // channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for reference
-// footprints always. A block per tile and group walks the whole list, and computes the weights again. It reads lists,
-// splats and rows of channels, and writes images, `transmittance` and `last`.
+// footprints always. A block per tile and group walks the whole list. It reads lists, splats and channels, and writes
+// images, `transmittance` and `last`.
 #pragma once
 
 #include "cuda/dispatch.h"
@@ -15,17 +15,15 @@ template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How the lanes of a warp share the C channels of its pixels. A lane computes the weights of its own pixel. But it
-/// sums a quarter of the channels of four pixels, which share a load from shared memory. Pixel i of lane l is the own
-/// pixel of lane l ^ 8 i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
+/// How lanes share the C channels of their pixels. A lane computes the weights of its own pixel, but sums a quarter of
+/// the channels of four pixels, which share a load from shared memory. Pixel i of lane l is the own pixel of lane l ^ 8
+/// i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
   float v[kPixels][kOwn];
 
-  /// The lane whose own pixel is pixel i.
   __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
-  /// The index of this lane's channel k in the group.
   __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
 
   /// From own pixels of lanes to this lane's pixels.
@@ -40,7 +38,6 @@ template <int C> struct ChannelShare {
     for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
   }
 
-  /// `contribution`: of the splat to the own pixel.
   __device__ void add(float contribution, const Eighth<C> (&splat)[8]) {
     float contributions[kPixels], own[kOwn];
     spread(contribution, contributions);
@@ -51,7 +48,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Adds up the kLanes lanes of a pixel. Each gets the sum.
+  /// Adds up the lanes of a pixel. Each gets the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
     if constexpr (kLanes > 1) {  // four lanes with the same channels
@@ -78,7 +75,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
     }
   }
-  /// The scalar product with a number per channel, of the own pixel.
+  /// Of the own pixel, with a number per channel.
   __device__ float dot(const float (&own)[kOwn]) const {
     float parts[kPixels];
 #pragma unroll
@@ -124,7 +121,7 @@ template <int C> struct ChannelShare {
     }
     return sums[0];
   }
-  /// Of weighted_sum(): the channel of this lane, and whether it is the first lane with this channel.
+  /// Of weighted_sum(): the channel of this lane, and whether the lane is the first with it.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
@@ -134,7 +131,7 @@ template <int kBatch, int C> struct GroupChannels {
   int32_t ids[kBatch];
   Eighth<C> values[kBatch][8];
 
-  /// A lane per channel. `reach` and `ids` of `count` splats must be known to all threads.
+  /// A lane per channel. All threads must know `reach` and `ids`.
   __device__ void load(const Channels<float>& channels, int first, int count, const uint8_t* reach) {
     constexpr int kAhead = 4;  // loads that wait together
     constexpr int kRows = kBlendThreads / C;

@@ -1,10 +1,10 @@
 // Kernel blend_groups_vjp: the backward pass for any number of channels, one group after the other.
 // channels/blend_vjp.cu launches it. A block per tile, a warp per subtile, walks the list back to front; lanes share
-// channels as in groups.cuh. It reads lists, splats, rows of channels, `last`, `transmittance` and the gradient of the
-// image, and writes pair_grads and channel_sums.
+// channels as in groups.cuh. It reads lists, splats, channels, `last`, `transmittance` and gradients of images, and
+// writes pair_grads and channel_sums.
 //
-// dL/dalpha is linear in the gradient of the image, so that each group adds its share to the sums of a pair. MeanSums
-// are not linear: if they are wanted, the first group makes all sums of shapes, and reads the channels of all groups.
+// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
+// for them the first group makes all sums of shapes, and reads the channels of all groups.
 #pragma once
 
 #include "cuda/channels/groups.cuh"
@@ -27,7 +27,7 @@ template <class F, int C> struct GroupVjpShared {
   uint8_t reach[kBatch];
 };
 
-/// The gradient of one sample of this lane's pixels, in its channels of the group from `first` on.
+/// Of one sample of this lane's pixels, in its channels of the group from `first` on.
 template <class F, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   int end = 0;  // pairs up to the last that any pixel composited
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) end = max(end, shared.last[b]);
-  // Pairs that nothing reached. Later groups of the same width find the zeros of the first.
+  // Pairs that nothing reached. Later groups of one width find the zeros of the first.
   if ((first == 0 || C == kSmallGroup) && !list.of_patch) {
     for (int k = end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
       clear_pair_together<C>(params, list.slot(k), first == 0);
@@ -216,7 +216,6 @@ template <class F, int C> void launch_group_vjp(const BlendVjpParams& p, int fir
   const auto kernel = with_shape ? blend_groups_vjp_kernel<F, C, true> : blend_groups_vjp_kernel<F, C, false>;
   launch(kernel, blocks, stream, p, first);
 }
-/// The group that begins with channel `first`.
 template <class F> void launch_blend_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   if constexpr (!F::kGeneric) {
     if (group_width<F>(p.channels.count - first) == kSmallGroup)

@@ -8,7 +8,7 @@ namespace {
 
 template <class F, int C, bool kKeep> void launch_kernels(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  const unsigned blocks = kBlocksPerSm * multiprocessors();  // share the tail
+  const unsigned blocks = kBlocksPerSm * multiprocessors();
   const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);

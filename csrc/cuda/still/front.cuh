@@ -2,7 +2,7 @@
 // launches it, then the kernels of tail.cuh. They read lists, splats and the plan (plan.cuh), and write images,
 // checkpoints, `transmittance` and `last`.
 //
-// The list of a tile is cut into chunks, the first of which are the front and the others the tail:
+// The first chunks of a list are the front, the others the tail:
 //
 //   `blend_front`    composites the front, until all pixels have stopped. A block per tile.
 //   `tail_through`   finds how much light each chunk of the tail lets through, if pixels are open. A block per chunk.
@@ -10,8 +10,7 @@
 //   `tail_blend`     composites each chunk from this transmittance on. A block per chunk.
 //   `tail_sum`       adds the chunks up.
 //
-// So a few tiles with long lists, as in small images of large scenes, fill the device too. The picture has the same
-// bits with and without a backward pass.
+// So a few tiles with long lists fill the device too. The picture has the same bits with and without a backward pass.
 #pragma once
 
 #include "cuda/launch.cuh"

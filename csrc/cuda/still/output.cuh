@@ -5,7 +5,6 @@
 
 namespace ar::cuda {
 
-/// Chunks of the front of each tile.
 __device__ inline int front_of(const BlendParams& params) {
   return front_chunks(params.grid, params.lists.counts->pairs, params.plan.blocks_at_once);
 }

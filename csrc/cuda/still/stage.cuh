@@ -19,7 +19,6 @@ template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
 
   /// Lists the `count` staged splats that reach this warp's pixels, and returns how many do. All lanes must call it.
   __device__ int list_reached(int count) { return lists.list(this->reach, 0, count); }
-  /// Calls visit(splat, entry) for entries [from, to) of the list.
   template <class Visit> __device__ __forceinline__ void for_each_listed(int from, int to, Visit&& visit) const {
     lists.for_each(from, to, [&](auto entry) { visit(Lists::splat_of(this->splats, entry), entry); });
   }

@@ -1,6 +1,5 @@
 // Kernels that finish the tiles that blend_front has left open; front.cuh has an overview, still/blend.cu launches
-// them. They read lists, splats, the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, `last` and
-// images.
+// them. They read lists, splats, the plan and `open_tiles`, and write checkpoints, `last` and images.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -10,7 +9,7 @@
 
 namespace ar::cuda {
 
-/// Calls visit(chunk, list of its tile, end of the chunk in the list) for this block's tail chunks of open tiles.
+/// Calls visit(chunk, its list, its end in the list) for this block's tail chunks of open tiles.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -22,7 +21,7 @@ template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const
   }
 }
 
-/// Stores what each tail chunk alone lets through, without a threshold. F: what a lane blends.
+/// What each tail chunk alone lets through, without a threshold. F: what a lane blends.
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads,
                                   blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive), kBlendThreads))
@@ -50,8 +49,8 @@ __global__ void __launch_bounds__(kBlendThreads,
   });
 }
 
-/// The next splat (alpha >= kAlphaMin) stops a sample with less transmittance than this, so the sample may count as
-/// stopped. The margin above kTransmittanceMin covers rounding, which differs between chunks and splats.
+/// The next splat, with alpha >= kAlphaMin, stops a sample with less transmittance: it may count as stopped. The margin
+/// covers rounding, which differs between chunks and splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -59,11 +58,11 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
   return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
 }
 
-/// Parts of 32 pixels, a block each: several multiprocessors read the checkpoints of a tile.
+/// Of 32 pixels, a block each.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// Replaces what each chunk lets through by the transmittance at its begin, negative if the sample has stopped before.
-/// `samples`: of a lane.
+/// From what each chunk lets through to the transmittance at its begin, negative if the sample has stopped. `samples`:
+/// of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = kTailLoads;
@@ -96,8 +95,8 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
   }
 }
 
-/// Stores the channels of each tail chunk and the transmittance at its end: zero if the sample had stopped before the
-/// chunk. F, C, kKeep: as in blend_front.
+/// Channels of each tail chunk and transmittance at its end: zero if the sample had stopped before. F, C, kKeep: as in
+/// blend_front.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
     tail_blend_kernel(const BlendParams params) {
@@ -141,8 +140,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks
 
 inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
 
-/// Adds the chunks of open tiles up, and writes pixels. The order depends on the number of tail chunks alone, not on
-/// kKeep. Samples: LaneSamples of what a lane blends. C, kKeep: as in blend_front.
+/// Adds chunks up, and writes pixels. Samples: LaneSamples of what a
+/// lane blends. C, kKeep: as in blend_front.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
@@ -156,7 +155,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
     const int front = front_of(params), chunks = chunks_of(params, tile);
     const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
-    int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // the warp has chunks [begin, end)
+    int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // of the warp's chunks
     const int end = min(begin + share, chunks);
     if (warp == 0) begin = checkpoints.first_chunk;
     Values<C> total = {};
@@ -165,7 +164,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     for (int s = 0; s < S; ++s) {
       const bool has_channels = kKeep || s == 0;
       Values<C> sum = {};
-      float last = 0;  // transmittance at the end of the last chunk that the sample reached
+      float last = 0;  // transmittance after the last chunk that the sample reached
       for (int first = begin; first < end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];

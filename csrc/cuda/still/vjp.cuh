@@ -3,10 +3,6 @@
 //
 // A warp goes through a chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp
 // makes the sums of a pair, without atomics, whose order would change from run to run.
-//
-//   vjp_pixels.cuh   pixels of a lane, in registers or in shared memory
-//   vjp_sums.cuh     listed splats, and sums over lanes
-//   vjp_walk.cuh     the chunk and the way through its pairs
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -52,7 +52,6 @@ struct PairSums {
   }
 };
 
-/// A splat of a batch that reaches its tile.
 template <class F, int C> struct alignas(16) ListedSplat {
   typename F::template Terms<float> terms;
   Values<C> channels;

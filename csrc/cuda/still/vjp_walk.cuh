@@ -1,5 +1,5 @@
-// A library for the kernel of still/vjp.cuh: how a warp of blend_vjp takes the pixels of a tile back to front through a
-// chunk. It reads lists, splats, checkpoints, `last`, `transmittance` and the gradient of the image, and writes rows of
+// A library for the kernel of still/vjp.cuh: a warp of blend_vjp takes the pixels of a tile back to front through a
+// chunk. It reads lists, splats, checkpoints, `last`, `transmittance` and gradients of images, and writes rows of
 // pair_grads.
 #pragma once
 
@@ -7,7 +7,7 @@
 
 namespace ar::cuda {
 
-/// The chunk of a warp: pairs [begin, end) of a tile's list.
+/// Pairs [begin, end) of a tile's list.
 struct VjpChunk {
   TileList list;
   int begin, end;
@@ -25,7 +25,7 @@ struct VjpChunk {
         image(int64_t(grid.width) * grid.height),
         size({float(grid.width), float(grid.height)}) {}
 
-  /// The index of a lane's pixel of subtile b; -1 outside of the image.
+  /// Of a lane's pixel of subtile b; -1 outside of the image.
   template <class F> __device__ int64_t pixel_index(int b, int lane) const {
     const Vec2<float> p = pixel_of<F>(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -33,8 +33,8 @@ struct VjpChunk {
   }
 };
 
-/// Pairs of the list up to the last one that any pixel of the tile composited. Also writes batch.subtile_last, for all
-/// lanes to read after the next __syncwarp().
+/// Pairs of the list up to the last that any pixel composited. Also writes batch.subtile_last; __syncwarp() must
+/// follow.
 template <class F, class Batch>
 __device__ __forceinline__ int find_last(const BlendVjpParams& params, const VjpChunk& chunk, Batch& batch) {
   const int lane = lane_id();
@@ -52,8 +52,8 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
   return tile_last;
 }
 
-/// Sets pixels and samples to their state after the chunk. `final`: only the background follows. checkpoints: [samples,
-/// kTilePixels] at the end of the chunk.
+/// The state of pixels and samples after the chunk. `final`: only the background follows. checkpoints: [samples,
+/// kTilePixels] after the chunk.
 template <class F, int C>
 __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const VjpChunk& chunk,
                                              const Checkpoint<C>* checkpoints, bool final, LanePixels<F, C>& pixels) {
@@ -99,15 +99,14 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   }
 }
 
-/// Takes the pixels of a tile back to front through a chunk, and sums the gradients of each pair, with kMeans also
-/// MeanSums. F: what a lane blends. C: channels.
+/// F: what a lane blends. C: channels. kMeans: with MeanSums.
 template <class F, int C, bool kMeans> class ChunkWalk {
  public:
   __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, LanePixels<F, C>& pixels,
                                        VjpBatch<F, C>& batch)
       : params_(params), chunk_(chunk), list_(chunk.list), pixels_(pixels), batch_(batch) {}
 
-  /// In batches of 32 pairs: lists the pairs that reach a pixel, then walks them. `tile_last`: of find_last().
+  /// In batches of 32 pairs: lists pairs that reach a pixel, then walks them. `tile_last`: of find_last().
   __device__ __forceinline__ void run(int tile_last) {
     static_assert(kChunkLength % 32 == 0);  // no batch begins before the chunk
     for (int k1 = min(chunk_.end, tile_last); k1 > chunk_.begin; k1 = (k1 - 1) / 32 * 32) {
@@ -147,10 +146,9 @@ template <class F, int C, bool kMeans> class ChunkWalk {
 
  private:
   static constexpr int S = F::kSamples, kSumCount = 6 + C;
-  /// Whether PairSums adds the sums of several pairs together.
   static constexpr bool kPairSums = kHoldsSamples<C>;
 
-  /// Walks the listed splats, farthest first. k0: first pair of the batch. `mean_map`: of the lane's own pair.
+  /// Farthest first. k0: first pair of the batch. `mean_map`: of the lane's own pair.
   template <MeanSums kKind> __device__ void walk_listed(int k0, int listed, const Mat2<float>& mean_map) {
     if constexpr (kPairSums) {
       for (int n = 0; n < listed; n += PairSums::kPairs) {
@@ -165,7 +163,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Takes the pixels that a splat reaches through it. `to`: a PairSums::Pair, or the index in the list.
+  /// Takes pixels through a splat. `to`: a PairSums::Pair, or the index in the list.
   template <MeanSums kKind, class To>
   __device__ void walk(const ListedSplat<F, C>& listed, int k0, const Mat2<float>& mean_map, To&& to) {
     const ListedSplat<F, C> splat = listed;
@@ -192,8 +190,8 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Takes the pixel of subtile b, at p, from after a splat to before it, and adds to the lane's sums. `at`: the pair,
-  /// by reference because the compiler else turns comparisons around.
+  /// Takes the pixel of subtile b, at p, from after a splat to before it. `at`: the pair, by reference because the
+  /// compiler else turns comparisons around.
   template <MeanSums kKind>
   __device__ void add_pixel(const ListedSplat<F, C>& splat, const int& at, const Mat2<float>& mean_map, int b,
                             Vec2<float> p, ShapeGrad<float>& shape, float& weighted, Values<C>& channels,
@@ -228,7 +226,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Sums over the lanes into the row of the pair, or stores the lanes' values at `to` for sum_pairs().
+  /// Sums over lanes into the row of the pair, or stores values at `to` for sum_pairs().
   template <class To>
   __device__ __forceinline__ void put_grads(int32_t row, ShapeGrad<float> shape, float weighted,
                                             const Values<C>& channels, To& to) {
