@@ -38,13 +38,14 @@ struct ListCut {
   int max_segments = 0, max_lists = 0;        ///< room; 0: no list is long
   int longest_from = kNoList;                 ///< pairs of the longest lists: a power of two; 0: all
 
-  /// Most segments of so many pairs. It does not depend on room, so that the same lists are always cut alike.
+  /// Most segments if all lists have `pairs`. It does not depend on room, so that the same lists are always cut alike.
   AR_HD int64_t segment_limit(int64_t pairs) const {
     if (at_least == 0) return max_segments;
     const int64_t all = pairs / segment + pairs / at_least, few = kSegments + pairs / segment / kPairsPerSegmented;
     return all < few ? all : few;
   }
-  /// Least pairs of a long list, if all lists have `pairs`: at_least, doubled until it is pairs / shares or more.
+  /// Least pairs of a long list, if all lists have `pairs`: at_least, doubled until it is pairs / shares or more. A
+  /// power of two, or 0.
   AR_HD int long_from(int64_t pairs) const {
     int64_t from = at_least;
     while (from > 0 && from < pairs / shares) from *= 2;
@@ -58,8 +59,8 @@ struct PlanCounts {
   int32_t chunks;  ///< in ChunkPlan::chunk_order
   int32_t tail;    ///< chunks of tails
 
-  int32_t cut_lists, segments;  ///< first in ChunkPlan::tile_order, and first in chunk_order
-  int32_t longest_lists;        ///< first among the cut lists
+  int32_t cut_lists, segments;  ///< the first of ChunkPlan::tile_order, and of chunk_order
+  int32_t longest_lists;        ///< the first of these
   int32_t open_tiles;           ///< open after the front
 };
 

@@ -25,9 +25,9 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
   if (params.channel_sums) clear(params.channel_sums, width);
 }
 
-Family family_of(int footprint, int channels) {
+Family family_at(int footprint, int channels) {
   Family found = Family::kStill;
-  visit_pixels(footprint, [&](auto f) { found = cuda::family_of<decltype(f)>(channels); });
+  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
   return found;
 }
 
@@ -36,7 +36,7 @@ Family family_of(int footprint, int channels) {
 int multiprocessors_of_device() { return int(multiprocessors()); }
 
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
-  const Family family = family_of(footprint, p.channels.count);
+  const Family family = family_at(footprint, p.channels.count);
   if (family == Family::kStill) blend_still(footprint, p, stream);
   if (family == Family::kMoment) blend_moment(footprint, p, stream);
   if (family == Family::kChannels) blend_channels(footprint, p, stream);
@@ -45,7 +45,7 @@ void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
   launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
-  const Family family = family_of(footprint, p.channels.count);
+  const Family family = family_at(footprint, p.channels.count);
   if (family == Family::kStill) blend_vjp_still(footprint, p, stream);
   if (family == Family::kMoment) blend_vjp_moment(footprint, p, first, stream);
   if (family == Family::kChannels) blend_vjp_channels(footprint, p, first, stream);

@@ -45,7 +45,7 @@ struct PairRange {
 inline constexpr int kManyTiles = 16;
 /// The tiles of a splat. One struct, because bin reads it in random order.
 struct alignas(16) SplatTiles {
-  TileMask mask;  ///< of 8x8 tiles from `first` on; 0: there are others
+  TileMask mask;  ///< of 8x8 tiles from `first` on; 0: there are tiles beyond
   int32_t first, count;
 };
 
@@ -159,8 +159,8 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   int64_t max_chunks;
   int32_t* chunks_taken;  ///< [1] chunks that warps have claimed
   float* checkpoints;     ///< as in BlendParams; moment/ adds those of cut lists
-  float* pair_grads;      ///< [rows, kPairGradWidth] a row per slot, max(capacity, n) in all; of patches per splat
-  float* channel_sums;    ///< [rows, channel_group()] or null
+  float* pair_grads;      ///< [max(capacity, n), kPairGradWidth] by slot; with patches by splat
+  float* channel_sums;    ///< [max(capacity, n), channel_group()] or null
   MeanSums mean_sums;
   float* adjoint_maps;  ///< [max_adjoint_maps()] moment/
   float* group_sums;    ///< [max_group_sums()] moment/
@@ -172,16 +172,15 @@ struct PairSumsView {
   const PairRange* ranges;  ///< [n]
   const Counts* counts;     ///< [1]
   int64_t capacity;
-  const float* pair_grads;  ///< [rows, kPairGradWidth]
+  const float* pair_grads;  ///< as in BlendVjpParams
 
-  /// Whether rows are of splats, not of slots.
   AR_HD bool by_splat() const { return counts->in_patches(capacity); }
 };
 
 /// From sums of pairs to gradients of channels [first, first + count) of every splat.
 struct SumChannelsParams {
   PairSumsView sums;
-  const float* channel_sums;  ///< [rows, width]; null: columns of pair_grads
+  const float* channel_sums;  ///< as in BlendVjpParams; null: columns of pair_grads
   int width;                  ///< kChannelGroup or kSmallGroup
   int first, count;
   float* dL_dchannels;  ///< [n, stride]

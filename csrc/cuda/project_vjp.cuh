@@ -119,7 +119,7 @@ struct GaussianRows {
   }
 };
 
-/// A source of project_vjp.
+/// A source of project_vjp: sums of pairs.
 struct FromPairs {
   using Params = ProjectVjpParams;
   static constexpr bool kZeroed = true;  ///< by zero_culled_grads

@@ -4,7 +4,6 @@
 // A tile of 16x16 pixels has eight subtiles of 8x4 pixels, one per warp. Subtile b is in column b % 2 and row b / 2 of
 // the tile. Lane l has the pixel in column l % 8 and row l / 8 of the subtile. With a Spread
 // (core/footprint/contract.h) a lane has a sample: neighbouring lanes share a pixel, and the tile has fewer pixels.
-//
 #pragma once
 
 #include <type_traits>

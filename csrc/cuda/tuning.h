@@ -112,12 +112,12 @@ inline constexpr int kTailLoads = 32, kTailLoadsKept = 16;
 
 /// Warps of a block of blend_vjp: few, against shared memory.
 constexpr int vjp_warps(int samples) { return samples == 1 ? 4 : 1; }
-/// Resident blocks of blend_vjp. Three channels are in registers, of which a fifth block leaves too few.
+/// Resident blocks of blend_vjp. Three channels need registers, of which a fifth block leaves too few.
 constexpr int vjp_blocks(int samples, bool expensive, int channels) {
   if (samples > 1) return channels == 3 ? 11 : 1;
   return channels == 3 ? 4 : expensive ? 5 : 6;
 }
-/// More than any device holds.
+/// No device holds more.
 inline constexpr int kVjpBlocksPerSm = 16;
 
 // channels/: groups of channels
