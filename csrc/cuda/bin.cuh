@@ -1,7 +1,6 @@
-// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. From what project or
-// shape_rows wrote, count_depths counts pairs, and digits of depth keys. By depth, emit_pairs and emit_long_pairs write
-// a pair for each tile that a splat touches. When pairs are sorted by tile, tile_offsets finds the first pair of each
-// tile.
+// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. count_depths counts splats,
+// pairs and digits of depth keys. By depth, emit_pairs and emit_long_pairs write a pair for each tile of a splat. By
+// tile, tile_offsets finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>
@@ -27,8 +26,8 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
   return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
 }
 
-/// Numbers the slots of a warp's kRows x 32 splats, from counts.pairs on, and counts them there. All lanes must call
-/// it. `ranges`: of the lane's first splat; the next is `stride` later.
+/// Hands out slots to kRows x 32 splats of a warp, and counts them. `ranges`: of the lane's first splat; the next is
+/// `stride` later. All lanes must call it.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -48,8 +47,7 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
   }
 }
 
-/// Counts splats with pairs, pairs, and digits of depth keys. Zeroes memory for later kernels.
-/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits].
+/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits]. counts: [1].
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
@@ -105,7 +103,7 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
-/// Digits of the sort by tile: as few, then as short, as the number of the last tile allows.
+/// Digits of the sort by tile: as few, then as short as the number of tiles allows.
 struct TileDigits {
   static constexpr int kMostBits = kTileDigitBits, kMostPasses = kTileDigits;
   int passes = 1, bits = kMostBits - 1;
@@ -124,12 +122,12 @@ struct TileDigits {
   }
 };
 
-/// Writes the pairs of a block, and counts the digits of their tiles.
+/// Writes pairs of a block, and counts digits.
 class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
 
-  /// `counts`: [kMostCounts], shared. All threads must call it; __syncthreads() before write().
+  /// counts: [kMostCounts] shared. All threads must call it, and __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
@@ -157,7 +155,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// Lane of a splat with few tiles, and bit of its mask.
+/// The lane of a splat with few tiles, and a bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -166,13 +164,10 @@ struct MaskedPair {
   __device__ int row() const { return value % kBits / 8; }
   __device__ int column() const { return value % 8; }
 };
-struct MaskedPairs {
-  MaskedPair of[32 * kManyTiles];
-};
 
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// The pairs of earlier blocks, from `status` [blocks] as in sort.cuh. All lanes must call it.
+/// Pairs of earlier blocks. status: [blocks] as in sort.cuh. All lanes must call it.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -189,18 +184,17 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Words of EmitParams::status: blocks that have begun, long splats, the count of each block.
+/// In EmitParams::status: blocks that have begun; long splats; counts of blocks.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// In the order of depth; the pairs of a splat by rows of tiles. Of long splats, whose tiles are not among 8x8, it
-/// lists the positions alone.
+/// In order of depth, then rows of tiles. Long splats (tiles beyond 8x8) are only listed.
 __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
-  __shared__ MaskedPairs stages[kEmitRows][kWarps];
+  __shared__ MaskedPair stages[kEmitRows][kWarps][32 * kManyTiles];
   const int64_t n = params.counts->splats;
   if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
@@ -231,16 +225,15 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // While earlier blocks count, the tiles are listed in shared memory; then neighbouring lanes write to neighbouring
-  // addresses.
+  // While earlier blocks count, tiles are listed in shared memory, for neighbouring lanes to write.
   const int warp = threadIdx.x / 32;
-  int up_to[kEmitRows];  // listed by lanes up to this one
+  int up_to[kEmitRows];  // listed, up to this lane
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const TileMask mask = few_tiles(touched[row]);
     const int own = mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
-    MaskedPair* next = stages[row][warp].of + up_to[row] - own;
+    MaskedPair* next = stages[row][warp] + up_to[row] - own;
 #pragma unroll
     for (int from = 0; from < MaskedPair::kBits; from += 32) {
       for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
@@ -271,7 +264,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
     }
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
-      const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
+      const MaskedPair pair = k < all ? stages[row][warp][k] : MaskedPair{};
       const int32_t position = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
       const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
       const int32_t slot = position + shuffle(to_slot, pair.lane());
@@ -295,37 +288,32 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   writer.finish();
 }
 
-/// The tiles of a splat's bounding box, and of a pixel around it for rounding.
 struct BoxOfTiles {
-  Range rows = {0, -1}, columns = {0, -1};
+  Range rows, columns;
 
-  __device__ BoxOfTiles() {}
-  __device__ BoxOfTiles(const Support<float>& support, TileGrid grid)
-      : rows(of_pixels(support.mean.y, support.half_height + support.reach, grid.height, grid)),
-        columns(of_pixels(support.mean.x, support.half_width + support.reach, grid.width, grid)) {}
   __device__ BoxOfTiles in_patches(int bits) const {
-    BoxOfTiles patches;
-    patches.rows = {rows.first >> bits, rows.last >> bits};
-    patches.columns = {columns.first >> bits, columns.last >> bits};
-    return patches;
+    return {{rows.first >> bits, rows.last >> bits}, {columns.first >> bits, columns.last >> bits}};
   }
   __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
-
- private:
-  __device__ static Range of_pixels(float middle, float half, int size, TileGrid grid) {
-    return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
-  }
 };
 
-/// Pairs of patches, where there is no room for all pairs of tiles. Their slots are the splats, to whose rows all
-/// patches add. Slow, with one block, but rare.
+/// With a pixel more for rounding.
+__device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGrid grid) {
+  const auto range = [&](float middle, float half, int size) {
+    return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
+  };
+  return {range(support.mean.y, support.half_height + support.reach, grid.height),
+          range(support.mean.x, support.half_width + support.reach, grid.width)};
+}
+
+/// Pairs of patches. One block: slow but rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
-  const auto tiles_of_splat = [&](int32_t id) { return BoxOfTiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. The whole image always fits.
+  const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
+  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. One for the whole image always fits.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
@@ -347,7 +335,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   int64_t before = 0;
   for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
     const int32_t id = r < n ? params.order[r] : -1;
-    const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles();
+    const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles{{0, -1}, {0, -1}};
     int64_t all;
     int64_t position = before + sum_before<kWarps>(patches.count(), int64_t(0), all);
     before += all;
@@ -362,8 +350,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// A warp for each long splat; or one block for the pairs of patches. The nearest splats are often long, and would all
-/// be in a few blocks of emit_pairs.
+/// A warp per long splat, which in emit_pairs would be in a few blocks; or one block for pairs of patches.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -402,7 +389,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   writer.finish();
 }
 
-/// Also reports the number of pairs to the host. tiles: [counts->listed]. tile_offsets: [tile_count + 1].
+/// Reports the pairs to the host. tiles: [counts->listed]. counts: [1]. tile_offsets: [tile_count + 1].
 __global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {

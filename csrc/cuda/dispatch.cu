@@ -1,5 +1,5 @@
-// Entry points of blending for csrc/torch: blend(), blend_vjp() and inspect() choose the family of kernels by the table
-// of dispatch.h.
+// Entry points of blending for csrc/torch. blend() and blend_vjp() call the family of kernels that the table of
+// dispatch.h names.
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/launch.cuh"
@@ -10,9 +10,8 @@ namespace {
 
 constexpr int kClearBlock = 256;
 
-/// Before the backward kernels: no chunk has been claimed; and where there are more pairs than room, sets the rows of
-/// splats to zero, to which all tiles add: pair_grads [n, kPairGradWidth], once for all groups of channels, and
-/// channel_sums [n, width] for the group of `width` channels from `first` on.
+/// Sets *chunks_taken to zero. If lists are of patches, also the rows that tiles add to: pair_grads for the first group
+/// of channels, and channel_sums [n, width] for every group.
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;
@@ -26,7 +25,7 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
   if (params.channel_sums) clear(params.channel_sums, width);
 }
 
-Family family(int footprint, int channels) {
+Family family_at(int footprint, int channels) {
   Family found = Family::kStill;
   visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
   return found;
@@ -37,31 +36,28 @@ Family family(int footprint, int channels) {
 int multiprocessors_of_device() { return int(multiprocessors()); }
 
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
-  switch (family(footprint, p.channels.count)) {
-    case Family::kStill:
-      return blend_still(footprint, p, stream);
-    case Family::kMoment:
-      return blend_moment(footprint, p, stream);
-    case Family::kChannels:
-      return blend_channels(footprint, p, stream);
-  }
+  const Family family = family_at(footprint, p.channels.count);
+  if (family == Family::kStill) blend_still(footprint, p, stream);
+  if (family == Family::kMoment) blend_moment(footprint, p, stream);
+  if (family == Family::kChannels) blend_channels(footprint, p, stream);
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
   launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
-  switch (family(footprint, p.channels.count)) {
-    case Family::kStill:
-      return blend_vjp_still(footprint, p, stream);
-    case Family::kMoment:
-      return blend_vjp_moment(footprint, p, first, stream);
-    case Family::kChannels:
-      return blend_vjp_channels(footprint, p, first, stream);
-  }
+  const Family family = family_at(footprint, p.channels.count);
+  if (family == Family::kStill) blend_vjp_still(footprint, p, stream);
+  if (family == Family::kMoment) blend_vjp_moment(footprint, p, first, stream);
+  if (family == Family::kChannels) blend_vjp_channels(footprint, p, first, stream);
 }
 
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) { launch_inspect<decltype(f)>(p, stream); });
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    with_tile_side<F>(p.grid, [&](auto side) {
+      launch(inspect_kernel<F, side>, {unsigned(p.grid.tiles()), kInspectThreads<side>}, stream, p);
+    });
+  });
 }
 
 }  // namespace ar::cuda

@@ -1,6 +1,5 @@
-// The table of blending: which family of kernels blends a footprint, in tiles of which size, and what memory that
-// takes. The functions of csrc/torch ask it for sizes, dispatch.cu asks it for the family. A test compares
-// Route::forward and Route::backward with the kernels that are launched.
+// The table of blending: family of kernels, tiles and memory by footprint. csrc/torch asks for sizes, dispatch.cu for
+// the family. A test compares the names in Route with the kernels that are launched.
 //
 // | footprint                          | channels | tiles                          | family    |
 // |------------------------------------|----------|--------------------------------|-----------|
@@ -16,8 +15,8 @@
 // | moment 4                           | any      | 8x8                            | moment/   |
 // | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |
 //
-// still/ blends a tile's list in chunks of 256 pairs; moment/ and channels/ walk the whole list, but where moment/ cuts
-// long lists into segments (moment/cut_lists.h). More than 4 channels are blended in groups.
+// still/ blends lists in chunks of 256 pairs. moment/ and channels/ walk whole lists, but moment/ cuts long lists into
+// segments (moment/cut_lists.h).
 #pragma once
 
 #include <algorithm>
@@ -32,11 +31,11 @@ namespace ar::cuda {
 
 enum class Family { kStill, kMoment, kChannels };
 
-/// log2 of the side of the tiles of a footprint F [px].
+/// log2 of the side of tiles [px].
 template <class F> constexpr int tile_bits_of(bool small_image) {
   return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
 }
-/// Calls visit with the side of the grid's tiles as a constant, one of the sides that F has.
+/// Calls visit with the side of tiles as a constant.
 template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
   constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
   if constexpr (kLarge != kSmall) {
@@ -44,14 +43,14 @@ template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit
   }
   visit(std::integral_constant<int, kSmall>());
 }
-/// Calls f with what a lane blends of F, a footprint of still samples, in tiles of this grid: F::Spread or F itself.
+/// Calls f with what a lane blends of F in this grid: F, or one sample of it (F::Spread).
 template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
   with_tile_side<F>(grid, [&](auto side) {
     using OfLane = std::conditional_t<(side < kTile), typename F::Spread, F>;
     f(OfLane{});
   });
 }
-/// Calls f(F{}) for what blending is compiled for of the footprint at position `footprint` of the registry.
+/// Calls f(PixelsOf<F>{}), which kernels are compiled for, of the footprint at this index of the registry.
 template <class Function> void visit_pixels(int footprint, Function&& f) {
   visit_footprint(footprint, Footprints{}, [&](auto chosen) { f(PixelsOf<decltype(chosen)>{}); });
 }
@@ -60,19 +59,25 @@ template <class F> constexpr Family family_of(int64_t channels) {
   if (F::kMoves) return Family::kMoment;
   return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
 }
+/// Calls f with what a lane blends of a footprint, if kFamily has kernels for it.
+template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {
+  visit_pixels(footprint, [&](auto pixels) {
+    using F = decltype(pixels);
+    if constexpr (!F::kMoves && (kFamily == Family::kChannels || !F::kGeneric)) with_lanes<F>(grid, f);
+  });
+}
 
-/// How a footprint is blended with so many channels.
 struct Route {
   Family family;
   int samples;          ///< of a pixel
-  int samples_of_lane;  ///< fewer where they are spread over lanes
+  int samples_of_lane;  ///< 1 with F::Spread
   ListCut cut;
-  /// Names of the kernels of blend and blend_vjp, in the order of their launches, but for those of all families.
+  // Kernels of the family, in order of launches.
   std::array<const char*, 5> forward;
   std::array<const char*, 4> backward;
 };
 
-/// `footprint`: position in the registry; `capacity`: pairs that there is room for.
+/// `capacity`: room for pairs.
 inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGrid grid, int multiprocessors) {
   Route route = {};
   visit_pixels(footprint, [&](auto f) {
@@ -103,8 +108,7 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
   return route;
 }
 
-/// Channels of the group that begins with the first of `left` channels, where there are more than kFewChannels, or the
-/// footprint is a reference.
+/// Channels of the next group; `left`: all that are left.
 template <class F> constexpr int group_width(int left) {
   return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }
@@ -114,8 +118,6 @@ inline int channel_group(int footprint, int left) {
   return width;
 }
 
-/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, of footprints whose samples move; 0 where no
-/// list is cut. max_group_sums() of params.h is the third.
 inline int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
   return int64_t(cut.max_segments) * (cut.segment / 32) * grid.side() * grid.side();
 }
@@ -123,7 +125,7 @@ inline int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) 
   return int64_t(cut.max_segments) * kMapNumbers * samples * grid.side() * grid.side();
 }
 
-/// Channels that still/ and moment/ are compiled for: 3 in the splats, or up to 4 in rows.
+/// Channels that still/ and moment/ are compiled for.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 
 }  // namespace ar::cuda

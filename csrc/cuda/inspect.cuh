@@ -1,5 +1,5 @@
-// The kernel of inspect, and its launch for blend.cu. It walks the lists of splats as blending does, and writes
-// statistics of every pixel and of every Gaussian (core/inspect.h).
+// Kernel inspect; dispatch.cu launches it. It walks lists as blending does, and writes statistics of pixels and
+// Gaussians (core/inspect.h).
 #pragma once
 
 #include <algorithm>
@@ -12,8 +12,8 @@ namespace ar::cuda {
 
 template <int kSide> inline constexpr int kInspectThreads = std::max(32, kSide* kSide);
 
-/// A block per tile of kSide x kSide pixels, a warp per subtile. A small tile has the subtiles of the first column of a
-/// large one; the smallest has a part of one subtile. F: the footprint.
+/// A block per tile of kSide x kSide pixels, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column,
+/// tiles of 4x4 a part of one subtile. F: the footprint.
 template <class F, int kSide>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();
@@ -24,18 +24,17 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
   const int lane = lane_id();
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of<F>(subtile, lane);
-  const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
-  const bool inside = max(p.x, p.y) < kSide && x < params.grid.width && y < params.grid.height;
-  PixelSummary<float, F> pixel;
-  pixel.start(inside);
-  for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kThreads) {
+  const bool inside = max(p.x, p.y) < kSide && Pixel(list, params.grid, p).inside;
+  PixelSummary<float, F> summary;
+  summary.start(inside);
+  for (int k = 0; k < list.count && __syncthreads_or(summary.open()); k += kThreads) {
     const int count = stage.load(params.splats, {}, list, k, list.count);
     if (int(threadIdx.x) < count) ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     for (int first = 0; first < count; first += 32) {
       for (uint32_t left = stage.reached(first, subtile); left != 0;) {
         const int j = first + take_first(left), id = ids[j];
-        const Shown<float> shown = pixel.add(stage.splats[j].terms, p, id);
+        const Shown<float> shown = summary.add(stage.splats[j].terms, p, id);
         const int touched = __popc(__ballot_sync(kAllLanes, shown.weight > 0));
         if (touched == 0) continue;
         const int in_front = __popc(__ballot_sync(kAllLanes, shown.in_front));
@@ -51,17 +50,10 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
     }
   }
   if (!inside) return;
-  const int64_t i = int64_t(y) * params.grid.width + x;
-  params.median[i] = pixel.median;
-  params.dominant[i] = pixel.dominant;
-  if (pixel.dominant >= 0) atomicAdd(&params.dominated[pixel.dominant], 1);
-}
-
-template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  with_tile_side<F>(p.grid, [&](auto px) {
-    constexpr int kSide = decltype(px)::value;
-    launch(inspect_kernel<F, kSide>, {unsigned(p.grid.tiles()), kInspectThreads<kSide>}, stream, p);
-  });
+  const int64_t i = Pixel(list, params.grid, p).index;
+  params.median[i] = summary.median;
+  params.dominant[i] = summary.dominant;
+  if (summary.dominant >= 0) atomicAdd(&params.dominated[summary.dominant], 1);
 }
 
 }  // namespace ar::cuda

@@ -1,4 +1,5 @@
-// Kernels that plan the blending work: how lists are cut into chunks, and in which order work is begun.
+// The kernels of plan_chunks; bin.cu launches them. count_work counts tiles and chunks by length. plan writes the
+// ChunkPlan (chunk_plan.h).
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -8,15 +9,13 @@
 namespace ar::cuda {
 
 inline constexpr int kCountWorkThreads = 1024, kPlanThreads = 256;
-/// Tiles of a thread of count_work whose loads wait together.
+/// Tiles of a thread whose loads wait together.
 inline constexpr int kTilesAtOnce = 2;
 
-/// The class of a piece of work by its length, between powers of two; longer work has a lower class. Work is handed out
-/// by class, so that no block starts on a long piece when the others are done. The order within a class is arbitrary.
+/// The class of a piece of work: longer work has a lower class, and begins first. The order in a class is arbitrary.
 __device__ inline int work_class(int length) { return __clz(length); }
 
-/// Takes a place of the class `of` where `wanted`. Lanes of one class go together: atomics to one place are slow. All
-/// lanes must call it.
+/// The next index in class `of`, if `wanted`, with an atomic per class of a warp. All lanes must call it.
 __device__ inline int take_place(int32_t* next, int of, bool wanted) {
   const uint32_t peers = __match_any_sync(kAllLanes, wanted ? of : -1);
   const int leader = __ffs(int(peers)) - 1;
@@ -25,11 +24,10 @@ __device__ inline int take_place(int32_t* next, int of, bool wanted) {
   return shuffle(first, leader) + __popc(peers & ((1u << lane_id()) - 1));
 }
 
-/// The list of a tile, and how it is cut.
 struct PlannedTile {
   int n;         ///< pairs
   int length;    ///< pairs of a chunk
-  bool is_long;  ///< as ListCut::long_from decides
+  bool is_long;  ///< by ListCut::long_from()
 
   __device__ PlannedTile(const TileLists& lists, int64_t tile, const ListCut& cut) {
     const bool in_patches = lists.counts->in_patches(lists.capacity);
@@ -37,14 +35,14 @@ struct PlannedTile {
     is_long = cut.max_segments > 0 && !in_patches && n >= cut.long_from(lists.counts->pairs);
     length = is_long ? cut.segment : cut.whole ? kWholeList : kChunkLength;
   }
-  /// The last segment of a long list is one of them, however long it is.
+  /// Full chunks, and the last segment of a long list.
   __device__ int full() const { return (is_long ? n + length - 1 : n) / length; }
   __device__ int rest() const { return is_long ? 0 : n % length; }
-  /// The class of the full chunks. Segments have that of their list, whose order they keep.
+  /// Segments have the class of their list.
   __device__ int full_class() const { return work_class(is_long ? n : length); }
 };
 
-/// Counts the work of each class, in as many parts as there are blocks, and begins the counts of the plan.
+/// Each block counts a part of the tiles. state: [1].
 __global__ void __launch_bounds__(kCountWorkThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
@@ -78,7 +76,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   if (c == 0) counts.planes = counts.tail = counts.open_tiles = 0;
 }
 
-/// What was counted of the class whose number is that of this thread; `of(sizes)`: the sizes meant.
+/// Of class threadIdx.x; `of` chooses tiles or chunks.
 template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
   static_assert(kLengthClasses < kPlanThreads);
   const int c = threadIdx.x;
@@ -88,18 +86,18 @@ template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of
   return size;
 }
 
-/// The lists that are cut: those of the first classes of long lists, as many as make no more than so many segments.
+/// Which lists are cut: classes of long lists, longest first, up to the limit of segments.
 struct CutClasses {
   int lists = 0, segments = 0, longest = 0;
-  int chunks_of_class;  ///< of this thread's class: what was counted, or a chunk for each list where they are not cut
+  int chunks_of_class;  ///< of this thread's class
 
-  /// `lists_of_class`, `counted`: of this thread's class. All threads of a block must call it.
+  /// lists_of_class, counted: of this thread's class. All threads must call it.
   __device__ CutClasses(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || tile_lists.counts->in_patches(tile_lists.capacity)) return;
     constexpr int kWarps = kPlanThreads / 32;
-    const int of_length = threadIdx.x;  // of threads beyond the classes both sizes are 0
+    const int of_length = threadIdx.x;  // beyond the classes both sizes are 0
     const bool are_long = of_length <= __clz(cut.long_from(pairs));
     int all;
     const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
@@ -111,8 +109,8 @@ struct CutClasses {
   }
 };
 
-/// Writes to shared memory where the work of each class begins, from the size of this thread's class. Returns the size
-/// of all classes. All threads of a block must call it, and afterwards wait for each other.
+/// Where each class begins, in shared memory. `size`: of this thread's class. Returns the size of all. All threads must
+/// call it, then __syncthreads().
 __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   const int c = threadIdx.x;
   int all;
@@ -121,12 +119,12 @@ __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   return all;
 }
 
-/// A tile's chunks [begin, end) and their places in a list of chunks, from `place` on.
+/// Chunks [begin, end) of a tile, at index `place` of a list.
 struct ChunkRun {
   int place, begin, end;
 };
-/// Writes the run of each lane; `first`: what chunk 0 would be, `of_chunk`: planes of a chunk. A warp writes long runs
-/// together, to neighbouring places. All lanes must call it.
+/// Writes the run of each lane; a warp writes long runs together. `first`: what chunk 0 would be. `of_chunk`: planes of
+/// a chunk. All lanes must call it.
 __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const TileChunk& first, int of_chunk) {
   constexpr int kMany = 4;
   const bool many = run.end - run.begin > kMany;
@@ -140,7 +138,7 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
   }
 }
 
-/// Places come from atomics: which tile gets which differs from run to run, and changes no result.
+/// A thread per tile. Atomics hand out indices, whose order changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {

@@ -54,8 +54,9 @@ void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_
   launch(zero_culled_grads_kernel, {multiprocessors() * kZeroBlocksPerSm, kZeroThreads, 0, begun}, stream, p);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
-  if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);
-  launch_rows(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);
+  if (!p.add) return launch_rows(project_vjp_kernel<Plain, FromRows>, project_vjp_kernel<Full, FromRows>, p, stream);
+  launch_rows(project_vjp_kernel<Plain, FromRows, StagedGrads>, project_vjp_kernel<Full, FromRows, StagedGrads>, p,
+              stream);
 }
 
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch_rows(shape_rows_kernel, p, p.n, stream); }

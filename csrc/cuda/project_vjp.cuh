@@ -1,7 +1,6 @@
-// The kernels of the backward pass after blend_vjp; project.cu launches them. `project_vjp` reads gradients of pairs,
-// and writes gradients of Gaussians; `zero_culled_grads` writes zeros for Gaussians without pairs, beside blend_vjp.
-// For public rows, `row_grads` writes gradients of rows, and `project_rows_vjp` reads these, perhaps on another rank.
-// And `sum_channels` writes gradients of further channels.
+// Kernels of the backward pass after blend_vjp; project.cu launches them. They read sums of pairs. project_vjp writes
+// gradients of Gaussians, also from gradients of public rows. Beside blend_vjp zero_culled_grads writes zeros for
+// Gaussians without pairs. row_grads writes gradients of public rows, and sum_channels of channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,8 +8,7 @@
 
 namespace ar::cuda {
 
-/// Gaussians of a warp, adjacent in memory. If none has pairs, zero_culled_grads writes their gradients, else
-/// project_vjp.
+/// Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
 inline constexpr int kGradRows = 32;
 static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
@@ -21,7 +19,7 @@ __device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(i
 struct SplatSums {
   float value[kPairGradWidth];
 
-  /// Adds up to kRows rows, loaded at once: [count, kPairGradWidth].
+  /// Adds up to kRows rows [count, kPairGradWidth].
   template <int kRows> __device__ void add(const float* rows, int count) {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
@@ -47,7 +45,7 @@ struct SplatSums {
   }
 };
 
-/// Sums the pairs of each lane's splat i, in a fixed order. All lanes must call it.
+/// Of splat i of each lane, in a fixed order. All lanes must call it.
 __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
   SplatSums sums = {};
   const auto row = [&](int64_t k) { return pairs.pair_grads + k * kPairGradWidth; };
@@ -72,7 +70,6 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   return sums;
 }
 
-/// Streaming, as nobody reads zeros soon.
 __device__ inline void zero_rows(float* to, int count) {
   if (count % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
     for (int e = lane_id(); e < count / 4; e += 32) store_streaming(reinterpret_cast<float4*>(to) + e, {0, 0, 0, 0});
@@ -92,7 +89,7 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
-/// `rows` as a view in which the first row has index `first`.
+/// A view that begins with index `first`.
 template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
@@ -101,7 +98,7 @@ template <class Row> __device__ const Row* view_from(const float* rows, int64_t 
 struct GaussianRows {
   float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
-  /// Begins to load the Gaussians of `lanes`, from `first` on. Returns views, to read after wait_for_copies().
+  /// Begins to load Gaussian first + k for lane k. Returns views, to read after wait_for_copies().
   __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
@@ -122,29 +119,17 @@ struct GaussianRows {
   }
 };
 
-/// to: [kCameraGradWidth].
-__device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
-  const float* values = &grad.view_x.x;
-#pragma unroll
-  for (int k = 0; k < kCameraGradWidth; ++k) {
-    const float total = warp_sum(values[k]);
-    if (lane_id() == 0) to[k] = total;
-  }
-}
-
-/// The source of project_vjp.
+/// A source of project_vjp: sums of pairs.
 struct FromPairs {
-  /// Whether zero_culled_grads writes zeros.
-  static constexpr bool kZeroed = true;
+  using Params = ProjectVjpParams;
+  static constexpr bool kZeroed = true;  ///< by zero_culled_grads
   const ProjectVjpParams& params;
 
-  /// count: 0 without gradient.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// All lanes must call it.
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
-  /// Calls use(function from splat to gradient, ShownGrad, MeanSums), if range.count > 0.
+  /// Calls use(function from splat to gradient, ShownGrad, sums).
   template <class Cam, class Use>
-  __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, PairRange, const SplatSums& sums,
+  __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, const SplatSums& sums,
                         Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
     const float depth = apply_row(camera.view_z, g.means[i]);
@@ -165,8 +150,9 @@ struct FromPairs {
   }
 };
 
-/// The source of project_rows_vjp.
+/// A source of project_vjp: gradients of public rows.
 struct FromRows {
+  using Params = ProjectRowsVjpParams;
   static constexpr bool kZeroed = false;
   const ProjectRowsVjpParams& params;
 
@@ -174,12 +160,9 @@ struct FromRows {
     const int32_t row = params.rows.rows[i];
     return {row, row >= 0 && has_gradient(params.rows, row) ? 1 : 0};
   }
-  struct Nothing {};
-  __device__ Nothing sum(int64_t, PairRange) const { return {}; }
+  __device__ int64_t sum(int64_t, PairRange range) const { return range.first; }  ///< the row
   template <class Cam, class Use>
-  __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, PairRange range, const Nothing&,
-                        Use&& use) const {
-    const int64_t row = range.first;
+  __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, int64_t row, Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
     if (params.rows.colors) shown.color = params.rows.colors[row];
     if (params.rows.depths) shown.depth = params.rows.depths[row];
@@ -188,19 +171,24 @@ struct FromRows {
   }
 };
 
-/// Coefficients are made in shared memory, then added.
+/// Adds gradients, of coefficients by way of shared memory.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
+  __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
 };
 
-template <class Cam> inline constexpr int kVjpBlocks = Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks;
-
-/// Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out: GaussianGrads<float> or StagedGrads.
-template <class Cam, class From, class Params, class Out>
-__device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
+/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out:
+/// GaussianGrads<float>, or StagedGrads with FromRows.
+template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
+__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks,
+                                                                 kProjectThreads))
+    project_vjp_kernel(const typename From::Params params) {
+  wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
+  const From from{params};
+  const Out& out = params.grads;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int lane = lane_id(), warp = threadIdx.x / 32;
   const int64_t first = i - lane;
@@ -225,7 +213,7 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   g.sh_stride = min(g.sh_stride, rows.kCount);  // in shared memory
   CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
-    from.visit(camera, g, i, range, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
+    from.visit(camera, g, i, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
       const auto grad_of_splat = [&](const Cov2d<float>& cov, float opacity) {
         forget_loads();
         return grad_of(cov, opacity);
@@ -239,32 +227,15 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   }
   const int stride = params.gaussians.sh_stride;
   if (out.shs) rows.template store<Out::kAdd>(out.shs + first * stride, stride, n);
-  if constexpr (Cam::kFull) {
-    if (camera_grads) store_warp_sums(camera_grad, camera_grads);
+  if (!Cam::kFull || !camera_grads) return;
+  const float* values = &camera_grad.view_x.x;
+#pragma unroll
+  for (int k = 0; k < kCameraGradWidth; ++k) {
+    const float total = warp_sum(values[k]);
+    if (lane == 0) camera_grads[k] = total;
   }
 }
 
-/// A thread per Gaussian.
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    project_vjp_kernel(const ProjectVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
-}
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromRows{params}, params.grads);
-}
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
-    add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromRows{params}, StagedGrads{{params.grads}});
-}
-
-/// A warp has several groups.
 __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
@@ -274,7 +245,7 @@ __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZero
   int count = count_of(first + lane_id());
   for (; first < n; first += step) {
     const uint32_t lit = lanes_with_pairs(count);
-    count = count_of(first + step + lane_id());  // of the next group, to arrive during the stores
+    count = count_of(first + step + lane_id());  // of the next group
     if (lit == 0) zero_grads_of_warp(params.gaussians, params.grads, first, rows_of_group(first, n));
   }
 }
@@ -296,7 +267,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
     dL_dcov = cov_grad(cov, grad.splat);
     dL_dopacity = grad.weighted / params.opacity(i);
   }
-  if (params.packed) {  // neighbouring threads at neighbouring addresses
+  if (params.packed) {
     const int width = params.packed_width;
     write_packed_grad(packed_rows + threadIdx.x * width, width, dL_dmean, {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy},
                       dL_dopacity, sums.color(), sums.mean_sums());
@@ -313,7 +284,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
-/// For channels that are columns of pair_grads. A thread per splat.
+/// A thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
@@ -327,8 +298,7 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// For groups of C channels; channel_sums: [max(capacity, n), C]. A splat has kSumLanes lanes, with many pairs a block;
-/// a lane has four channels.
+/// channel_sums: [rows, C]. A splat has kSumLanes lanes, or with many pairs the block. A lane has four channels.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
@@ -341,7 +311,6 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
   const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
-  // Of rows `row`, `row` + step, ...
   const auto sum_rows = [&](const PairRange& of_splat, int row, int step) {
     const auto* quads = reinterpret_cast<const float4*>(params.channel_sums) + int64_t(of_splat.first) * kQuads + quad;
     float4 sum = {0, 0, 0, 0};
@@ -357,7 +326,6 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
     }
     return sum;
   };
-  // Over `lanes` adjacent lanes.
   const auto sum_lanes = [&](float4& sum, int lanes) {
     for (int offset = kQuads; offset < lanes; offset *= 2) {
       add(sum, {__shfl_xor_sync(kAllLanes, sum.x, offset), __shfl_xor_sync(kAllLanes, sum.y, offset),

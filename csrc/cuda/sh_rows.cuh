@@ -74,11 +74,11 @@ template <int kDegree> struct ShRows {
 #pragma unroll
     for (int step = 0; step < kSteps; ++step) {
       const int k = 32 * step + lane_id();
-      const CopyTarget to(quad(k / kQuads, k % kQuads));
+      float4* to = quad(k / kQuads, k % kQuads);
       const uint32_t mine = lanes >> k / kQuads;
 #pragma unroll
       for (int row = 0; row < 32; row += kRowsOfStep) {
-        if (mine >> row & 1) to.copy(row * kStride / 4, from + 32 * step + row * kQuads);
+        if (mine >> row & 1) copy_async(to + row * kStride / 4, from + 32 * step + row * kQuads);
       }
     }
   }

@@ -1,6 +1,5 @@
-// A library for bin.cu: a pass of a stable radix sort whose number of items only the device knows; for a library's sort
-// the host would wait. It is "Onesweep" of Adinets and Merrill (2022): one histogram for all digits, then a pass per
-// digit, in which a block looks back at what earlier blocks have published.
+// A library for bin.cu and bin.cuh: a pass of a stable radix sort, where only the device knows the number of items. It
+// is "Onesweep" of Adinets and Merrill (2022): a block adds up what earlier blocks have published.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -18,10 +17,10 @@ template <int kBits> struct Digits : SortTuning<kBits> {
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
 };
 
-/// The key of no item, left out by the first pass.
+/// The key of no item.
 inline constexpr uint32_t kNoKey = 0xffffffff;
 
-// A block publishes a word: a count, and whether it includes all earlier blocks. Zero is nothing yet.
+// A block publishes a count, and whether it includes all earlier blocks. Zero: nothing yet.
 inline constexpr uint32_t kOfBlock = 1u << 30, kUpToBlock = 2u << 30, kCountMask = kOfBlock - 1;
 inline constexpr int64_t kMaxSortItems = kCountMask;
 
@@ -61,14 +60,14 @@ template <int kBits> struct SortScratch {
         blocks(blocks_of(capacity)) {}
 };
 
-/// Counts kPasses digits of a warp's keys in `histograms` [kPasses, kBins]. All lanes must call it.
+/// histograms: [kPasses, kBins]. All lanes must call it.
 template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
   constexpr int kBins = Digits<kBits>::kBins;
   if (!__any_sync(kAllLanes, valid)) return;
 #pragma unroll
   for (int pass = 0; pass < kPasses; ++pass) {
     const uint32_t digit = Digits<kBits>::of(key, pass);
-    // Neighbours often agree, and atomics to one address are slow.
+    // Neighbours often agree; atomics to one address are slow.
     int agree = 0;
     __match_all_sync(kAllLanes, valid ? digit : kBins, &agree);
     if (agree) {
@@ -79,8 +78,7 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
   }
 }
 
-/// Items of earlier blocks with a digit. `status`: the word of this block, `width` words after that of the block
-/// before.
+/// Items of earlier blocks. `status`: of this block; the block before is `width` words before.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
   if (block == 0) return 0;
   uint32_t sum = 0;
@@ -100,24 +98,22 @@ __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block,
 
 template <int kBits, class Value> struct SortShared {
   using D = Digits<kBits>;
-  struct Sorted {  ///< in the order of this pass
+  struct Sorted {
     uint32_t keys[D::kTile];
     Value values[D::kTile];
   };
   union {
-    uint32_t counts[D::kWarps][D::kBins];  ///< of a warp; then
-    Sorted sorted;
+    uint32_t counts[D::kWarps][D::kBins];  ///< at first
+    Sorted sorted;                         ///< then, in the order of this pass
   };
   uint16_t next[D::kWarps][D::kBins];  ///< position in the block of a warp's next item
   uint32_t to_global[D::kBins];        ///< from position in the block
   uint32_t block;
 };
 
-/// Sorts *count items by digit `pass`.
-/// kBits: of a digit. Value: int32_t or SlotPair. kFirst: keys that are kNoKey are no items, and values are indices.
-/// All arrays: [*count]; with kFirst keys_in is [capacity]. Null keys_out: not written.
-/// may_skip: the last pass ends at once where all items have one digit. Earlier passes then exchange the arrays of
-/// values, so that the result lies where the last pass would write it.
+/// Sorts *count items by digit `pass` of kBits bits. Value: int32_t or SlotPair. kFirst: values are indices, and kNoKey
+/// is left out. Arrays: [*count]; with kFirst keys_in: [capacity]. keys_out may be null. may_skip: the last pass ends
+/// at once if all items have one digit; earlier passes exchange values_in and values_out for it.
 template <int kBits, class Value, bool kFirst>
 __global__ void __launch_bounds__(Digits<kBits>::kThreads,
                                   blocks_per_sm(Digits<kBits>::kBlocks, Digits<kBits>::kThreads))
@@ -152,14 +148,16 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {
-    // Later passes count keys past the end too: they come last.
+    // Later passes count keys past the end, which come last.
     if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
-  [[maybe_unused]] Value values[kItems];
-  if constexpr (!kFirst) {
+  Value values[kItems];
 #pragma unroll
-    for (int i = 0; i < kItems; ++i) {
-      if (whole || first + 32 * i < n) values[i] = values_in[first + 32 * i];
+  for (int i = 0; i < kItems; ++i) {
+    if constexpr (kFirst) {
+      values[i] = Value(first + 32 * i);
+    } else if (whole || first + 32 * i < n) {
+      values[i] = values_in[first + 32 * i];
     }
   }
   __syncthreads();
@@ -199,11 +197,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
     if (valid) {
       if ((peers & lanes_after) == 0) next = uint16_t(position + 1);
       shared.sorted.keys[position] = keys[i];
-      if constexpr (kFirst) {
-        shared.sorted.values[position] = Value(first + 32 * i);
-      } else {
-        shared.sorted.values[position] = values[i];
-      }
+      shared.sorted.values[position] = values[i];
     }
     __syncwarp();
   }
@@ -214,7 +208,6 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   }
   __syncthreads();
 
-  // Neighbouring threads write to neighbouring addresses.
   const uint32_t here = kFirst ? uint32_t(all) : uint32_t(min(n - begin, int64_t(D::kTile)));
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {

@@ -1,10 +1,9 @@
-// A library for all kernels of blending: which pixels a lane has, the list of a tile, which pixels a splat reaches, and
-// the splats that a block copies to shared memory (stages). It launches nothing.
+// A library for all kernels of blending: pixels of a lane, list of a tile, reach of a splat, and splats that a block
+// stages in shared memory.
 //
-// A tile of 16x16 pixels consists of eight subtiles of 8x4 pixels, and a warp has a subtile: subtile b is in column
-// b % 2 and row b / 2 of the tile, and lane l has the pixel in column l % 8 and row l / 8 of the subtile. For a Spread
-// (core/footprint/contract.h) a lane has a sample instead: the samples of a pixel are in neighbouring lanes, and the
-// tile has fewer pixels. Each splat is tested against the subtiles once, and warps skip splats that do not reach them.
+// A tile of 16x16 pixels has eight subtiles of 8x4 pixels, one per warp. Subtile b is in column b % 2 and row b / 2 of
+// the tile. Lane l has the pixel in column l % 8 and row l / 8 of the subtile. With a Spread
+// (core/footprint/contract.h) a lane has a sample: neighbouring lanes share a pixel, and the tile has fewer pixels.
 #pragma once
 
 #include <type_traits>
@@ -20,12 +19,11 @@ inline constexpr int kTilePixels = kTile * kTile;
 inline constexpr int kSubtiles = 8;
 inline constexpr int kBlendThreads = 32 * kSubtiles;
 
-/// Columns and rows of pixels of a subtile. A Spread has fewer: 256 lanes are 256 samples.
+/// Of a subtile [px].
 template <class F> inline constexpr int kSubtileWide = 8 >> (kTileBits - spread_tile_bits(F::kLanes, true));
 template <class F> inline constexpr int kSubtileHigh = kSubtileWide<F> / 2;
 
-/// How many samples of a pixel a lane has, and how many lanes have samples of one pixel: all that kernels know of a
-/// footprint that do not evaluate it.
+/// Stands for the footprint in kernels that do not evaluate it.
 template <int S, int kLanesOfPixel> struct LaneSamples {
   static constexpr int kSamples = S, kLanes = kLanesOfPixel;
 };
@@ -37,13 +35,12 @@ template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
   const int pixel = lane / F::kLanes;
   return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
 }
-/// The position of a lane's sample in subtile b, from the tile's first pixel, where `of_first` is its position in
-/// subtile 0. Blend and blend_vjp both call this, because alpha must have the same bits in both: one addition of a
-/// whole number.
+/// The position of a lane's sample in subtile b; `of_first`: in subtile 0. blend and blend_vjp share this addition,
+/// because alpha must have the same bits in both.
 template <class F> __device__ Vec2<float> position_in(int b, Vec2<float> of_first) {
   return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
 }
-/// The same by the lane's number. Where a lane has all samples of a pixel, it is the position of the pixel.
+/// The same by lane; of a pixel, if the lane has all its samples.
 template <class F> __device__ Vec2<float> position_of(int b, int lane) {
   Vec2<float> of_first = pixel_of<F>(0, lane);
   if constexpr (F::kLanes > 1) {
@@ -57,29 +54,28 @@ template <class F> __device__ Vec2<float> position_of(int b, int lane) {
   return position_in<F>(b, of_first);
 }
 
-/// Splat `id` of those that `project` wrote: `splats` are rows of kSplatWidth numbers. All kernels of blending read
-/// splats through this function.
+/// All kernels of blending read splats [n, kSplatWidth] here.
 template <class F> __device__ Splat<F, float> load_splat(const float* splats, int32_t id) {
   return reinterpret_cast<const Splat<F, float>*>(splats)[id];
 }
 __device__ inline void prefetch_splat(const float* splats, int32_t id) { prefetch(splats + int64_t(id) * kSplatWidth); }
 
-/// A tile and its list of splats, front to back.
+/// A tile and its list, front to back.
 struct TileList {
-  int x0, y0;            ///< first pixel of the tile
-  const int32_t* pairs;  ///< [count, stride] splats, and their slots where stride is 2
+  int x0, y0;            ///< first pixel
+  const int32_t* pairs;  ///< [count, stride] splats (and slots)
   int stride, count;
-  bool of_patch;  ///< the list is that of a patch, and has splats that do not reach this tile
+  bool of_patch;  ///< some splats do not reach this tile
 
   __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
   __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
 };
 
-/// A tile among the tiles of its patch, which share a list.
+/// A tile among the tiles of its patch.
 struct TileInPatch {
   int first_tile;  ///< of the patch
-  int tiles;       ///< of the patch, as far as it is in the image
-  int index;       ///< of the tile among these
+  int tiles;       ///< of the patch
+  int index;       ///< of the tile
 
   __device__ TileInPatch(const TileLists& lists, TileGrid grid, int tile) {
     const int bits = int(lists.counts->patch_bits), side = 1 << bits, columns = grid.columns();
@@ -104,9 +100,9 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   return list;
 }
 
-/// Which boxes of kWide x kHigh pixels a splat reaches: bit b for the box in column b % kColumns and row b / kColumns
-/// of kColumns x kRows boxes whose first pixel is at (x0, y0). A box that the splat passes closely may be among them;
-/// only for footprints with expensive weights exact extents are worth their cost.
+/// Which of kColumns x kRows boxes of kWide x kHigh pixels, from pixel (x0, y0) on, a splat reaches. Bit b: column b %
+/// kColumns, row b / kColumns. It may include boxes that the splat almost reaches: an exact test pays only if weights
+/// are expensive.
 template <int kWide, int kHigh, int kColumns, int kRows, class F>
 __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
   static_assert(kColumns * kRows <= 32);
@@ -125,7 +121,7 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
     }
   } else {
     const Mat2<float> w = F::ellipse(splat.shape);
-    const Vec2<float> middle = {0.5f * (kWide - 1), 0.5f * (kHigh - 1)};  // of a box, from its first pixel
+    const Vec2<float> middle = {0.5f * (kWide - 1), 0.5f * (kHigh - 1)};
     const Vec2<float> first = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
     const float distance = float(max(kWide * kColumns, kHigh * kRows)) + max(abs(first.x), abs(first.y));
     const BoxReach<float> box =
@@ -144,12 +140,11 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
   return reached;
 }
 
-/// Bit b: the splat reaches subtile b of a tile at (x0, y0), or passes it closely.
+/// Bit b: subtile b of the tile at (x0, y0).
 template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& splat, int x0, int y0) {
   return reached_boxes<kSubtileWide<F>, kSubtileHigh<F>, 2, 4, F>(splat, x0, y0);
 }
 
-/// Values of C channels.
 template <int C> struct Values {
   float v[C];
 
@@ -165,8 +160,37 @@ template <int C> struct Values {
 };
 template <> struct Values<0> {};
 
-/// Adds to `sums` what a splat contributes in the S samples of a lane. composite(s) composites the splat into sample s
-/// and returns what blend_sample returns. A branch around a single addition becomes a predicate, which costs nothing.
+/// The state of a lane's S samples between splats. kSets sets of C channels: 1, or S if checkpoints need them. The
+/// transmittance of a sample that has stopped is negative.
+template <int S, int C, int kSets> struct PixelState {
+  float transmittance[S];
+  Values<C> channels[kSets];
+  int last[S];
+
+  __device__ void start(bool open) {
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
+    clear_channels();
+  }
+  __device__ void clear_channels() {
+#pragma unroll
+    for (int k = 0; k < kSets; ++k) channels[k] = {};
+  }
+  __device__ Values<C> total() const {
+    Values<C> sum = channels[0];
+#pragma unroll
+    for (int k = 1; k < kSets; ++k) sum += channels[k];
+    return sum;
+  }
+  __device__ bool open() const {
+    bool any = false;
+#pragma unroll
+    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
+    return any;
+  }
+};
+
+/// Adds what a splat contributes to the S samples of a lane. composite(s): blend_sample() of sample s.
 template <int S, int C, class Composite>
 __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
   float contribution = 0;
@@ -190,18 +214,15 @@ template <int C> __device__ Values<C> times(float scale, const Values<C>& values
   return scaled;
 }
 
-/// What the pixels of a tile need of a splat: its terms, and C channels.
+/// A staged splat.
 template <class F, int C> struct alignas(16) TileSplat {
   typename F::template Terms<float> terms;
   Values<C> channels;
 };
 
-/// A staged splat in use: copied to registers, unless it has too many numbers.
-template <class F, int C>
-using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
+template <class F, int C> using TileSplatRef = const TileSplat<F, C>;
 
-/// The channels of splat `id`: three lie in the splat; else C channels of its row from `first` on, and zeros beyond the
-/// last channel.
+/// C channels of splat `id`: the three in the splat, or its row from `first` on, then zeros.
 template <int C, class F>
 __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id,
                                  int first = 0) {
@@ -222,9 +243,8 @@ __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F,
   }
 }
 
-/// For each of kWarps warps of a block a list of up to kMost staged splats that reach its pixels. To walk a list costs
-/// less per splat than to find the next bit of a mask. An entry is the number of a splat times kUnit: with kUnit = the
-/// size of a splat it is an offset in memory. kAhead entries are read at a time.
+/// For each of kWarps warps a list of up to kMost staged splats that reach its pixels: cheaper to walk than a mask. An
+/// entry is an index times kUnit: an offset in memory with kUnit = sizeof(splat). kAhead entries are read at once.
 template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct ReachLists {
   using Entry = EntryType;
   struct alignas(kAhead * sizeof(Entry)) Entries {
@@ -232,14 +252,9 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   };
   alignas(Entries) Entry of_warps[kWarps][kMost];
 
-  /// Lists the staged splats in [from, to) that reach this warp's pixels, and returns their number. Bit w of reach[k]
-  /// says that splat k reaches the pixels of warp w; `reach` is read up to the next multiple of 32. All lanes must call
-  /// it.
-  template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
-    return list(reach, from, to, int(threadIdx.x) / 32);
-  }
-  /// The same for the splats whose bit `number` is set.
-  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number) {
+  /// Lists splats k in [from, to) with bit `number` in reach[k], which is read up to the next multiple of 32. Returns
+  /// how many there are. All lanes must call it.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number = int(threadIdx.x) / 32) {
     const int warp = threadIdx.x / 32;
     int n = 0;
     for (int k = from; k < to; k += 32) {
@@ -251,14 +266,12 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
     __syncwarp();
     return n;
   }
-  /// The number of a listed splat.
   __device__ static int number_of(Entry entry) { return int(entry) / kUnit; }
-  /// The staged splat of an entry.
   template <class Splat> __device__ static const Splat& splat_of(const Splat* splats, Entry entry) {
     static_assert(sizeof(Splat) % kUnit == 0);
     return *reinterpret_cast<const Splat*>(reinterpret_cast<const char*>(splats) + entry * (sizeof(Splat) / kUnit));
   }
-  /// Calls visit(entry) for the entries [from, to) of this warp's list; `from` is a multiple of kAhead.
+  /// Visits entries [from, to) of this warp. `from` is a multiple of kAhead.
   template <class Visit> __device__ __forceinline__ void for_each(int from, int to, Visit&& visit) const {
     const Entry* list = of_warps[threadIdx.x / 32];
     int k = from;
@@ -279,13 +292,12 @@ template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, cons
   return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
 }
 
-/// Up to kBatch splats of a tile, with C channels, that a block works on together. A thread loads one splat.
+/// Splats that a block works on together.
 template <class F, int C, int kBatch> struct Stage {
   TileSplat<F, C> splats[kBatch];
   uint8_t reach[kBatch];
 
-  /// Loads splats [k, k + kBatch) of the list, and returns how many there are before `end`. `splats_in`: rows of
-  /// kSplatWidth numbers.
+  /// Loads pairs [k, k + kBatch), one per thread, and returns how many are before `end`. splats_in: [n, kSplatWidth].
   __device__ int load(const float* splats_in, const Channels<float>& channels, const TileList& list, int k, int end) {
     const int t = threadIdx.x;
     if (kBatch == kBlendThreads || t < kBatch) {
@@ -301,29 +313,25 @@ template <class F, int C, int kBatch> struct Stage {
     return min(end - k, kBatch);
   }
 
-  /// The splats in [k, k + 32) that reach a subtile, in the order of take_first. All lanes must call it.
-  __device__ uint32_t reached(int k, int subtile) const {
+  /// Splats [k, k + 32) that reach a subtile, for take_first(). All lanes must call it.
+  __device__ uint32_t reached(int k, int subtile = threadIdx.x / 32) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }
-  /// The same for this warp's subtile.
-  __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
 };
 
-/// A sample at the end of a chunk, stored for the backward pass.
+/// A sample at the end of a chunk.
 template <int C> struct alignas(C == 3 ? 16 : 4) Checkpoint {
   Values<C> channels;
-  float transmittance;  ///< negated where the sample has stopped
+  float transmittance;  ///< negative: stopped
 };
 
-/// The tile of chunk number `chunk` of blend_vjp, where a chunk is the whole list of a tile; -1 if there is no such
-/// chunk. Where lists are cut, the segments have the first numbers, and the lists that are not cut follow.
+/// The tile of a chunk that is a whole list; -1: no such chunk. Segments of cut lists have the first numbers.
 __device__ inline int listed_tile(const BlendVjpParams& params, int chunk) {
   return chunk < params.plan->counts.chunks ? params.chunk_order[chunk].tile : -1;
 }
 
-/// A pixel of the image.
 struct Pixel {
-  int64_t index, image;  ///< number of the pixel, and of all pixels
+  int64_t index, image;  ///< of the pixel; number of pixels
   bool inside;
 
   __device__ Pixel(const TileList& list, TileGrid grid, Vec2<float> p) {
@@ -334,10 +342,9 @@ struct Pixel {
   }
 };
 
-/// The share of one sample in its pixel.
 template <class F> inline constexpr float kSampleShare = 1.0f / (F::kSamples * F::kLanes);
 
-/// Index of sample s of this lane's pixel in an array of [samples, H, W].
+/// In arrays [samples, height, width].
 template <class F> __device__ int64_t sample_index(int64_t image, int64_t pixel, int s) {
   return (F::kLanes > 1 ? lane_id() % F::kLanes : s) * image + pixel;
 }
@@ -345,33 +352,28 @@ template <class F> __device__ int64_t sample_index(const Pixel& pixel, int s) {
   return sample_index<F>(pixel.image, pixel.index, s);
 }
 
-/// The sum over the lanes that hold a pixel's samples.
 template <class F> __device__ float sum_of_pixel(float x) {
 #pragma unroll
   for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
   return x;
 }
-/// Whether this lane writes what belongs to the whole pixel.
 template <class F> __device__ bool writes_pixel(int lane) { return lane % F::kLanes == 0; }
 
-/// The gradient with respect to a channel of one of a pixel's samples.
 template <class F> __device__ float sample_gradient(const BlendVjpParams& params, const Pixel& pixel, int channel) {
   const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
   return pixel.inside && plane ? kSampleShare<F> * plane[pixel.index] : 0.0f;
 }
 
-/// Zeros for a pair that no sample composites, in `row` of pair_grads: by one thread.
+/// Zeros in `row` of pair_grads, for a pair that no sample composites.
 __device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
   auto* numbers = reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth);
 #pragma unroll
   for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
 }
 
-/// Threads that clear_pair_together takes for a pair.
 inline constexpr int kClearThreads = kChannelGroup / 4;
 
-/// The same by kClearThreads neighbouring threads, all of which must call it: clears the row of pair_grads, if
-/// `shapes`, and the row of kWidth channel_sums, if there are any.
+/// The same by kClearThreads neighbouring threads: in pair_grads, if `shapes`, and in channel_sums [rows, kWidth].
 template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
   const int q = threadIdx.x % kClearThreads;
   const float4 zero = {0, 0, 0, 0};
@@ -379,7 +381,7 @@ template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& 
   if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + row * kWidth)[q] = zero;
 }
 
-/// Writes a gradient sum into row `row`: of the pair; or, `of_patch`, of the splat, to whose row all tiles add.
+/// Writes to rows [, width]. Lists of patches add, as other tiles add too.
 __device__ inline void put_sum(float* rows, int width, bool of_patch, int32_t row, int column, float x) {
   float* place = rows + int64_t(row) * width + column;
   if (of_patch) {

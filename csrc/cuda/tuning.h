@@ -1,41 +1,30 @@
-// A library of numbers: what was chosen by measuring, each with what it trades, and the launch bounds. Kernels,
-// launches, chunk_plan.h and pair_guess.h read them. Nothing here needs CUDA's headers. Numbers of blocks that should
-// fill a device are given per multiprocessor; multiprocessors() (launch.cuh) asks the device how many it has.
+// A library of numbers that were chosen by measuring, with what they trade, and of launch bounds. Kernels, launches,
+// chunk_plan.h and pair_guess.h read them.
 #pragma once
 
-#include <cstddef>
+#include <initializer_list>
 
 namespace ar::cuda {
 
 // Devices
 
-/// Threads that a multiprocessor can hold, by __CUDA_ARCH__; of an unknown device the least.
+/// Threads that a multiprocessor can hold, by __CUDA_ARCH__.
 constexpr int resident_threads(int architecture) {
-  switch (architecture) {
-    case 800:
-    case 900:
-    case 1000:
-    case 1030:
-      return 2048;
-    case 860:
-    case 870:
-    case 880:
-    case 890:
-    case 1100:
-    case 1200:
-    case 1210:
-      return 1536;
-    default:
-      return 1024;  // 750
+  for (int known : {800, 900, 1000, 1030}) {
+    if (architecture == known) return 2048;
   }
+  for (int known : {860, 870, 880, 890, 1100, 1200, 1210}) {
+    if (architecture == known) return 1536;
+  }
+  return 1024;  // 750; the least, for unknown devices
 }
 #if defined(__CUDA_ARCH__)
 inline constexpr int kArchitecture = __CUDA_ARCH__;
 #else
 inline constexpr int kArchitecture = 900;  // the host needs none
 #endif
-/// The second launch bound: the blocks `wanted` on a multiprocessor, or what fits. More blocks hide more latency, and
-/// leave fewer registers to a thread.
+/// The second launch bound: `wanted` resident blocks, or what fits. More blocks hide more latency, with fewer
+/// registers.
 constexpr int blocks_per_sm(int wanted, int threads, int architecture = kArchitecture) {
   const int fit = resident_threads(architecture) / threads;
   return fit < 1 ? 1 : fit < wanted ? fit : wanted;
@@ -43,50 +32,49 @@ constexpr int blocks_per_sm(int wanted, int threads, int architecture = kArchite
 
 // Room for pairs: pair_guess.h
 
-/// Frames that are counted at first, and after a frame with too many pairs: each waits, and shows another view.
+/// Frames that are counted, which waits: at first, and after too many pairs.
 inline constexpr int kCountedFrames = 32, kRecountedFrames = 8;
-/// Memory for each pair of the largest frame so far, against frames with too many.
+/// Per pair of the largest frame so far: memory against frames with too many pairs.
 inline constexpr double kRoomPerPair = 1.25;
-/// With just 1, splats on the borders of patches would leave only the whole image as a patch.
+/// For splats on borders of patches.
 inline constexpr double kRoomPerGaussian = 1.125;
 /// For small scenes, whose views differ most.
 inline constexpr int kReservedRoom = 1 << 16;
 
 // Projection: project.cuh, project_vjp.cuh
 
-/// Shared memory of a block, against a camera to load for each.
+/// Shared memory against loads of the camera.
 inline constexpr int kProjectThreads = 128;
-/// Four times what fits: a block loads the camera once; more blocks share the Gaussians more evenly.
+/// Loads of the camera against an even share of Gaussians.
 inline constexpr int kProjectBlocksPerSm = 32;
-/// With six a thread would have 80 registers, and spill. The full camera needs all registers.
+/// With six blocks a thread would have 80 registers, and spill. The full camera needs all registers.
 inline constexpr int kProjectVjpBlocks = 5, kFullProjectVjpBlocks = 1;
-/// A warp sums splats with more pairs together: all lanes work, but on one splat after the other.
+/// A whole warp sums splats with more pairs.
 inline constexpr int kManyPairs = 64;
-/// Rows that a lane loads at once: registers, against waiting.
+/// Rows that a lane loads at once: registers against waiting.
 inline constexpr int kRowsAtOnce = 4;
-/// `zero_culled_grads` waits for memory while blend_vjp computes beside it. It displaces at most one block of
-/// blend_vjp on a multiprocessor.
+/// zero_culled_grads takes the room of one block of blend_vjp, which computes beside it.
 inline constexpr int kZeroThreads = 128, kZeroBlocksPerSm = 1;
-/// Limits the registers of zero_culled_grads; so many blocks never run.
+/// Only limits the registers of zero_culled_grads.
 inline constexpr int kZeroBlocks = 16;
-/// Lanes for each splat: most splats have few pairs, and more lanes would idle.
+/// Lanes per splat: most splats have few pairs.
 inline constexpr int kSumThreads = 256, kSumLanes = 8;
-/// Rows that a lane loads at once, and loads from which a block sums a splat together.
+/// Rows that a lane loads at once, and loads of a lane from which on a block sums a splat.
 inline constexpr int kSumRowsAtOnce = 4, kSumManyLoads = 16;
 
 // Binning: bin.cuh
 
-/// A block adds its histogram to that of all: fewer blocks add less often.
+/// Few blocks, because each adds a histogram.
 inline constexpr int kCountThreads = 1024, kCountBlocksPerSm = 1;
-/// Keys that a thread loads at once: registers, against waiting.
+/// Keys that a thread loads at once: registers against waiting.
 inline constexpr int kCountAtOnce = 4;
 /// Limits a thread to 48 registers.
 inline constexpr int kEmitBlocks = 5;
-/// Enough for a view with many long splats; the others end at once.
+/// Enough for many long splats.
 inline constexpr int kLongBlocksPerSm = 4;
-/// Tiles of a block, and lanes that search for each: more lanes take fewer steps.
+/// Tiles of a block, and lanes that search for each.
 inline constexpr int kOffsetTiles = 16, kOffsetLanes = 8;
-/// Bits of a digit, and digits, at most. A longer digit saves passes; a pass gets slower.
+/// Most bits of a digit, and most digits: fewer passes, or faster ones.
 inline constexpr int kTileDigitBits = 8, kTileDigits = 4;
 
 // Sorts: sort.cuh
@@ -95,125 +83,107 @@ inline constexpr int kTileDigitBits = 8, kTileDigits = 4;
 template <int kBits> struct SortTuning {
   static constexpr bool kLong = kBits > 8;
   static constexpr int kThreads = kLong ? 512 : 256;  ///< at least one for each value of a digit
-  static constexpr int kItems = kLong ? 10 : 12;      ///< of a thread: fewer blocks, against registers
-  static constexpr int kBlocks = kLong ? 2 : 3;       ///< on a multiprocessor: against registers
+  static constexpr int kItems = kLong ? 10 : 12;      ///< per thread: fewer blocks against registers
+  static constexpr int kBlocks = kLong ? 2 : 3;       ///< resident, against registers
 };
 /// Counts of earlier blocks that a thread loads at once.
 inline constexpr int kLookBackAtOnce = 8;
 
 // All blending
 
-/// Blocks of 256 threads that a multiprocessor works on side by side, about. So many blocks fill a device: tiles beyond
-/// the work of a single one of them are split (front_chunks() of chunk_plan.h), which changes last bits.
+/// Blocks of 256 threads that fill a multiprocessor. Last bits depend on it, by front_chunks().
 inline constexpr int kBlocksPerSm = 8;
 
 // still/: samples that stay
 
-/// Splats that a warp composites between two votes on whether any of its samples is still open.
+/// Splats between two votes on whether any sample is open.
 inline constexpr int kBetweenVotes = 16;
-/// Chunks of the front of a tile in small images, and the least in others. A longer front leaves less to the tail,
-/// whose kernels work side by side but do more work.
+/// Chunks of the front in small images, and the least in others. The tail takes more work, which blocks share.
 inline constexpr int kShortFront = 1, kLongFront = 8;
-/// Largest splat in a stage [bytes] that is copied to registers before use.
-inline constexpr size_t kSplatInRegisters = 112;
 
-/// Resident blocks of blend_front for lanes with `samples` samples and staged splats of so many bytes.
-constexpr int front_blocks(int samples, bool expensive, size_t splat_bytes) {
-  return samples > 1 ? 1 : expensive || splat_bytes > 96 ? 4 : 5;
-}
-/// Resident blocks of tail_through and tail_blend.
-constexpr int tail_through_blocks(int samples, bool expensive, size_t splat_bytes) {
-  return samples > 1 ? 3 : front_blocks(samples, expensive, splat_bytes);
-}
+/// Resident blocks of blend_front, tail_through and tail_blend; `samples`: of a lane.
+constexpr int front_blocks(int samples, bool expensive) { return samples > 1 ? 1 : expensive ? 4 : 5; }
+constexpr int tail_through_blocks(int samples, bool expensive) { return samples > 1 ? 3 : expensive ? 4 : 5; }
 constexpr int tail_blend_blocks(int samples) { return samples > 1 ? 3 : 4; }
-/// Warps of a block of tail_sum, which share the chunks of 32 pixels: a single warp waits for memory most of the time.
+/// Warps of tail_sum that share the chunks of 32 pixels.
 inline constexpr int kTailSumWarps = 4;
 /// Chunks whose numbers tail_scan and tail_sum load together.
 inline constexpr int kTailLoads = 32, kTailLoadsKept = 16;
 
-/// Warps of a block of blend_vjp, each with a chunk of its own: as few as let shared memory hold many blocks.
-constexpr int vjp_warps(int samples) { return samples <= 2 ? 4 : 1; }
-/// Resident blocks of blend_vjp. Where lanes hold pixels in registers, a fifth block would leave each lane too few.
-constexpr int vjp_blocks(int samples, bool holds_pixels, bool holds_samples, size_t splat_bytes) {
-  return samples > 1 ? (holds_samples ? 11 : 1) : holds_pixels ? 4 : splat_bytes <= 48 ? 6 : 5;
+/// Warps of a block of blend_vjp: few, against shared memory.
+constexpr int vjp_warps(int samples) { return samples == 1 ? 4 : 1; }
+/// Resident blocks of blend_vjp. Three channels need registers, of which a fifth block leaves too few.
+constexpr int vjp_blocks(int samples, bool expensive, int channels) {
+  if (samples > 1) return channels == 3 ? 11 : 1;
+  return channels == 3 ? 4 : expensive ? 5 : 6;
 }
-/// Blocks of blend_vjp per multiprocessor, which take chunks until none is left: as many as any device holds.
+/// No device holds more.
 inline constexpr int kVjpBlocksPerSm = 16;
 
 // channels/: groups of channels
 
 /// Splats between two barriers of blend_groups.
 inline constexpr int kGroupBatch = 128;
-/// Splats between two barriers of blend_groups_vjp. Its warps do not all meet equally many of them, so more is better,
-/// as long as a few blocks fit into shared memory.
+/// Of blend_groups_vjp: more splats balance its warps, against shared memory.
 constexpr int group_vjp_batch(bool small_group) { return small_group ? 64 : 32; }
 /// Resident blocks of both.
-constexpr int group_blocks(int samples, bool small_group) {
-  return samples > 4 ? 1 : samples > 1 ? 2 : small_group ? 5 : 4;
-}
+constexpr int group_blocks(int samples, bool small_group) { return samples > 1 ? 2 : small_group ? 5 : 4; }
 
 // moment/: samples that move
 
 /// Channels that are blended at once where there are more than kFewChannels.
 inline constexpr int kMovingChannels = 8;
-/// Entries of a warp's list of splats that are read at a time.
+/// Entries of a warp's list of splats that are read at once.
 constexpr int list_ahead(int cells_of_lane) { return cells_of_lane <= 2 ? 4 : 1; }
-/// Threads of moving_blend that a multiprocessor should hold, by channels.
+/// Resident threads of moving_blend.
 constexpr int moving_threads(int channels) { return channels == 3 ? 1024 : 0; }
 
-/// Lists of so many pairs are cut into segments in large images, unless the share of a block (kBlocksAtOnce per
-/// multiprocessor) of all pairs is larger. To cut a list takes more work than to walk it, but other blocks share it.
+/// In large images lists of so many pairs are cut into segments, or of the share of a block (kListBlocksPerSm) if that
+/// is more. A cut list takes more work, which blocks share.
 inline constexpr int kLongList = 4096;
 inline constexpr int kListBlocksPerSm = 4;
-/// Pairs of a segment. Longer segments need fewer maps, which count where there are many samples; shorter ones fill a
-/// device with smaller scenes.
+/// Pairs of a segment. Longer segments need fewer maps, shorter ones fill a device with smaller scenes.
 constexpr int segment_length(int samples, bool small_tiles) {
   return samples == 1 || small_tiles ? 256 : samples <= 4 ? 512 : 1024;
 }
-/// Lists of so many pairs would outlast all others in the forward pass if a warp had several of their pixels: a block
-/// has a single one. With more than four samples that holds for all lists that are cut.
+/// For lists of so many pairs a block has a single pixel, not to outlast all others.
 constexpr int longest_list(int samples) { return samples <= 4 ? 16384 : 0; }
-/// The largest number of segments in large images: kSegments, and those of one pair in kPairsPerSegmented.
+/// Most segments in large images: kSegments, and the segments of one pair in kPairsPerSegmented.
 inline constexpr int kSegments = 4096, kPairsPerSegmented = 4;
 
-/// Pairs that a block of filter_kernel tests at a time.
+/// Pairs that a block of filter_kernel tests at once.
 inline constexpr int kFilterPiece = 256;
-/// Blocks of filter_kernel, and warps of listed_blend, per multiprocessor in large images: as many as leave most of the
-/// device to moving_blend, which begins beside them as soon as all of them have begun.
+/// Blocks of filter_kernel and warps of listed_blend in large images: most of the device is left to moving_blend, which
+/// begins beside them.
 inline constexpr int kFilterBlocksPerSm = 2, kListedWarpsPerSm = 8;
-/// Of so many of the longest lists in small images each warp of listed_blend has one task.
+/// Longest lists in small images of which each warp of listed_blend has one task.
 inline constexpr int kLongestAtOnce = 128;
-/// Warps of a block of listed_blend, which share a pixel of the longest lists.
+/// Warps of listed_blend that share a pixel of the longest lists.
 constexpr int listed_warps(int samples) { return samples == 1 ? 1 : 4; }
 /// Pairs in the queues of a warp.
 inline constexpr int kQueued = 1024;
 
-/// Threads of the backward kernels that a multiprocessor should hold: more threads have fewer registers, but waiting
-/// for the samples' earlier positions costs more than a few numbers in memory. `segments`: of cut lists.
+/// Resident threads of the backward kernels: spills cost less than waiting. `segments`: of cut lists.
 constexpr int moving_vjp_threads(int channels, int cells_of_lane, bool segments) {
   return channels > 3 ? 512 : cells_of_lane > 2 && !segments ? 768 : 1024;
 }
-/// Threads of segment_maps that a multiprocessor should hold.
+/// Resident threads of segment_maps.
 inline constexpr int kMapThreads = 1024;
-/// Earlier positions per lane that are in shared memory; more would take more from the cache than they save.
+/// Earlier positions per lane in shared memory, against the cache.
 inline constexpr int kMostInShared = 8;
-/// Groups of a segment for each warp of its block. With one cell, whose tiles of 8x8 pixels have two groups, a block of
-/// one warp would take too long; in tiles of 4x4 pixels fewer warps were slower.
-inline constexpr int kMostGroupsOfWarp = 2;
-constexpr int groups_of_warp(int samples, bool small_tiles) {
-  return samples == 1 || small_tiles ? 1 : kMostGroupsOfWarp;
-}
-/// Segments whose maps chain_maps reads at once, since each of them waits for memory.
+/// Groups of a segment per warp: fewer, but longer blocks.
+constexpr int groups_of_warp(int samples, bool small_tiles) { return samples == 1 || small_tiles ? 1 : 2; }
+/// Segments whose maps chain_maps loads at once.
 inline constexpr int kMapsAhead = 8;
-/// Groups of a tile up to which their sums are added up in shared memory; with more groups they would leave room for
-/// too few blocks, and are in BlendVjpParams::group_sums. Pairs between two barriers in either case.
+/// Groups of a tile whose sums are added in shared memory; of more groups in BlendVjpParams::group_sums. And pairs
+/// between two barriers.
 inline constexpr int kMostSumsInside = 2;
 constexpr int segment_batch(bool sums_inside) { return sums_inside ? 64 : 128; }
 
 // Training: ssim.cu, adam.cu, activations.cu, weight.cu
 
 inline constexpr int kSsimThreads = 256, kSsimColumns = 32;
-/// Neighbouring sums of a thread: fewer loads from shared memory, against registers, of which doubles take two.
+/// Neighbouring sums of a thread: loads from shared memory against registers.
 template <typename T> inline constexpr int kSsimRun = sizeof(T) == 4 ? 4 : 1;
 /// A thread loads kAdamBytes of each array at once.
 inline constexpr int kAdamThreads = 256, kAdamBytes = 16;

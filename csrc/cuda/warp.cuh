@@ -1,5 +1,5 @@
-// A library for all kernels: sums, votes and searches over the lanes of a warp, which all lanes must call, and loads,
-// stores and copies, which single lanes may call.
+// A library for all kernels: sums, votes and searches over a warp, which all lanes must call; and loads, stores and
+// copies of single lanes.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@ inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
 
-/// In every lane; in a fixed order.
+/// In every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
@@ -20,17 +20,21 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
-/// Lanes below 16 get the sum of x, the others of y: 5 shuffles instead of 10, and the bits of warp_sum.
-__device__ inline float warp_sum_of_two(float x, float y) {
-  const bool upper = lane_id() & 16;
+/// Over this lane and lane_id() ^ offset: the sum of y in the upper lane, of x in the lower.
+__device__ inline float sum_of_pair(const float& x, const float& y, bool upper, int offset) {
   const float keep = upper ? y : x, give = upper ? x : y;
-  float sum = keep + __shfl_xor_sync(kAllLanes, give, 16);
+  return keep + __shfl_xor_sync(kAllLanes, give, offset);
+}
+
+/// Lanes below 16 get the warp_sum of x, the others of y.
+__device__ inline float warp_sum_of_two(float x, float y) {
+  float sum = sum_of_pair(x, y, lane_id() & 16, 16);
 #pragma unroll
   for (int offset = 8; offset > 0; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
   return sum;
 }
 
-/// Over the lanes up to this one. T has shuffle(), shuffle_up() and a + that need not commute.
+/// T has shuffle(), shuffle_up() and a +, which need not commute.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
 #pragma unroll
   for (int offset = 1; offset < 32; offset *= 2) {
@@ -40,7 +44,7 @@ template <typename T> __device__ T warp_inclusive_sum(T v) {
   return v;
 }
 
-/// Over the threads before this one, of a block of kWarps warps or of one warp. `all`: over all. `zero` + v is v.
+/// Over the threads before this one, of a block of kWarps warps or of a warp (1). `all`: over all threads.
 template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all) {
   const T up_to = warp_inclusive_sum(own);
   T before = shuffle_up(up_to, 1);
@@ -83,7 +87,7 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
-/// Lanes whose `bits` agree with this lane's in `mask`, a single bit. The compiler would need seven instructions.
+/// Lanes whose `bits` agree with this lane's in `mask`, one bit.
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
@@ -111,8 +115,7 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// The first k of [0, n) for which before(k) is false, if it is false from there on. For each group of kLanes lanes,
-/// which divides the range by kLanes + 1 in a step.
+/// The first k of [0, n) from which on before(k) is false, for each group of kLanes lanes.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -126,7 +129,7 @@ template <int kLanes, class Before> __device__ int partition_point(int n, Before
   return found;
 }
 
-/// LaunchShape::shared_bytes of them.
+/// LaunchShape::shared_bytes.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
   extern __shared__ float4 memory[];
@@ -136,15 +139,14 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes and returns the first number of a set. Number j < 32 is bit 31 - j: the lowest bit would take one more slow
-/// instruction to find.
+/// Removes and returns the first number of a set. Number j is bit 31 - j, which is found faster than bit j.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
   return first;
 }
 
-/// Of what nobody reads soon.
+/// For numbers that are not read soon.
 __device__ inline void store_streaming(float4* to, const float4& value) {
 #if defined(__CUDA_ARCH__)
   __stcs(to, value);
@@ -153,23 +155,26 @@ __device__ inline void store_streaming(float4* to, const float4& value) {
 #endif
 }
 
-///
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)
   asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
 #endif
 }
 
-/// Begins to copy a number to shared memory, for all lanes to read after wait_for_copies().
-__device__ inline void copy_async(float* to, const float* from) {
+/// To shared memory, to be read after wait_for_copies(). T: float or float4.
+template <class T> __device__ void copy_async(T* to, const T* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
-  asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(from) : "memory");
+  if constexpr (sizeof(T) == 16) {
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(from) : "memory");
+  } else {
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(from) : "memory");
+  }
 #else
   *to = *from;
 #endif
 }
-/// Rows of kWidth numbers, one for each of `lanes`. Neighbouring lanes copy neighbouring numbers.
+/// Rows [32, kWidth] of `lanes`.
 template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
@@ -177,34 +182,6 @@ template <int kWidth> __device__ void copy_rows_async(float* to, const float* fr
     if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
   }
 }
-/// An address in shared memory. The empty statement keeps the compiler from computing it again for every copy.
-class CopyTarget {
- public:
-  __device__ explicit CopyTarget(float4* to) {
-#if __CUDA_ARCH__ >= 800
-    address_ = uint32_t(__cvta_generic_to_shared(to));
-    asm volatile("" : "+r"(address_));
-#else
-    to_ = to;
-#endif
-  }
-  /// Begins to copy a quad, past the cache of the multiprocessor.
-  __device__ void copy(int offset, const float4* from) const {
-#if __CUDA_ARCH__ >= 800
-    constexpr int kBytes = sizeof(float4);
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address_ + kBytes * offset), "l"(from) : "memory");
-#else
-    to_[offset] = *from;
-#endif
-  }
-
- private:
-#if __CUDA_ARCH__ >= 800
-  uint32_t address_;
-#else
-  float4* to_;
-#endif
-};
 __device__ inline void wait_for_copies() {
 #if __CUDA_ARCH__ >= 800
   asm volatile("cp.async.wait_all;" ::: "memory");
@@ -212,11 +189,11 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-/// The compiler keeps no loads from before this in registers.
+/// The compiler loads again what it has loaded before this.
 __device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
 
-/// Sums N = 8, 9 or 10 values over the lanes, with 9 or 12 shuffles instead of 5 N: two lanes exchange halves of their
-/// values. Lane l gets the sum of value summed_value<N>(l).
+/// Sums 8, 9 or 10 values with 9 or 12 shuffles instead of 5 N, as lanes exchange halves of their values. Lane l gets
+/// the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();
@@ -227,24 +204,17 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   for (int half = 4, offset = 16; half > 0; half /= 2, offset /= 2) {
     const bool upper = lane & offset;
 #pragma unroll
-    for (int i = 0; i < half; ++i) {
-      const float keep = upper ? a[i + half] : a[i], give = upper ? a[i] : a[i + half];
-      a[i] = keep + __shfl_xor_sync(kAllLanes, give, offset);
-    }
+    for (int i = 0; i < half; ++i) a[i] = sum_of_pair(a[i], a[i + half], upper, offset);
     if (N == 10 && half == 4) {
-      const float keep = upper ? v[N - 1] : last, give = upper ? last : v[N - 1];
-      last = keep + __shfl_xor_sync(kAllLanes, give, offset);
+      last = sum_of_pair(last, v[N - 1], upper, offset);
     } else if (N > 8) {
       last += __shfl_xor_sync(kAllLanes, last, offset);
     }
   }
-  const bool upper = lane & 2;
-  const float keep = N > 8 && upper ? last : a[0], give = N > 8 && !upper ? last : a[0];
-  const float sum = keep + __shfl_xor_sync(kAllLanes, give, 2);
+  const float sum = sum_of_pair(a[0], N > 8 ? last : a[0], lane & 2, 2);
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 
-/// Lanes with the same value have the same bits.
 template <int N> __device__ int summed_value(int lane) {
   return N > 8 && lane & 2 ? (N > 9 && lane & 16 ? 9 : 8) : lane / 4;
 }

@@ -190,7 +190,7 @@ class CudaBackend final : public Backend {
     // Blocks of blend_vjp must start later: they stay until no work is left. In a captured graph only a kernel can wait
     // for that, and the next node may be none.
     const bool ordered = !is_capturing(stream_);
-    cuda::zero_culled_grads(p, side_->stream(1), ordered ? side_->begun() : nullptr);
+    cuda::zero_culled_grads(p, side_->stream(), ordered ? side_->begun() : nullptr);
     if (ordered) side_->wait_until_begun();
     if (pass.debug) join();
     check_stage("zero_culled_grads", pass.debug);
@@ -397,7 +397,7 @@ class CudaBackend final : public Backend {
   c10::cuda::CUDAStream stream_;
   at::TensorOptions floats_, ints_, longs_, bytes_;
   Laps laps_;
-  std::optional<cuda::SideStreams<1>> side_;
+  std::optional<cuda::SideStream> side_;
 };
 
 }  // namespace

@@ -4,12 +4,8 @@
 namespace ar::cuda {
 
 void blend_channels(int footprint, const BlendParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (!F::kMoves) {
-      with_lanes<F>(p.grid, [&](auto of_lane) { launch_blend_groups<decltype(of_lane)>(with_channels(p), stream); });
-    }
-  });
+  visit_lanes<Family::kChannels>(
+      footprint, p.grid, [&](auto of_lane) { launch_blend_groups<decltype(of_lane)>(with_channels(p), stream); });
 }
 
 }  // namespace ar::cuda

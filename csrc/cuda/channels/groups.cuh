@@ -1,9 +1,7 @@
-// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, for a last group of up to 8,
-// of 8. A block per tile and group walks the whole list, with a pixel (or a sample of a Spread) per lane. It reads
-// lists, splats and rows of channels, and writes images, and for a backward pass transmittance and `last`.
-// blend_channels (channels/blend.cu) launches it: for footprints whose samples stay, with more than four channels; and
-// for reference footprints always, whose weights are slow anyway. Each group computes the weights again, which costs
-// less than to store them.
+// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8.
+// channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for reference
+// footprints always. A block per tile and group walks the whole list. It reads lists, splats and channels, and writes
+// images, `transmittance` and `last`.
 #pragma once
 
 #include "cuda/dispatch.h"
@@ -13,46 +11,33 @@
 
 namespace ar::cuda {
 
-/// An eighth of the channels of a splat in a group of C.
 template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How the lanes of a warp share the C channels of its pixels. Each lane computes the weights of its own pixel. But
-/// sums over channels or pixels are shared out differently, so that a channel read from shared memory serves four
-/// pixels: a lane has a quarter of the channels of the four pixels in its column. Pixel i of lane l is the own pixel of
-/// lane l ^ 8 i (i = 0: of itself), and the lane has the eighths l / 4 and l / 4 ^ 1 of the channels.
+/// How lanes share the C channels of their pixels. A lane computes the weights of its own pixel, but sums a quarter of
+/// the channels of four pixels, which share a load from shared memory. Pixel i of lane l is the own pixel of lane l ^ 8
+/// i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
   float v[kPixels][kOwn];
 
-  /// The lane whose own pixel is pixel i here.
   __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
-  /// The index in the group of this lane's channel k.
   __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
 
-  /// From a number per lane, of its own pixel, to the numbers of this lane's pixels.
+  /// From own pixels of lanes to this lane's pixels.
   __device__ static void spread(float own, float (&of_pixels)[kPixels]) {
     of_pixels[0] = own;
 #pragma unroll
     for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
   }
-  /// Sums over the four lanes that share a pixel, for this lane's own pixel.
-  __device__ static float gather(const float (&parts)[kPixels]) {
-    float sum = parts[0];
-#pragma unroll
-    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
-    return sum;
-  }
-  /// This lane's channels of a splat.
   __device__ static void read(const Eighth<C> (&splat)[8], float (&own)[kOwn]) {
     const Eighth<C> first = splat[lane_id() / 4], second = splat[lane_id() / 4 ^ 1];
 #pragma unroll
     for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
   }
 
-  /// Adds a splat, of which `contribution` reaches this lane's own pixel.
   __device__ void add(float contribution, const Eighth<C> (&splat)[8]) {
     float contributions[kPixels], own[kOwn];
     spread(contribution, contributions);
@@ -63,23 +48,23 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Adds up the kLanes lanes that have the samples of a pixel. Each gets the sum.
+  /// Adds up the lanes of a pixel. Each gets the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
-    if constexpr (kLanes > 1) {  // four neighbours have the same channels
+    if constexpr (kLanes > 1) {  // four lanes with the same channels
       add_from_lane(1, 0);
       add_from_lane(2, 0);
     }
     if constexpr (kLanes == 16) {
-      add_from_lane(4, kHalf);  // the first eighth that this lane has is the second of that one
+      add_from_lane(4, kHalf);  // its eighths are in the other order
 #pragma unroll
-      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart are of the same pixel
+      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart
 #pragma unroll
         for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
       }
     }
   }
-  /// Adds the channels of the lane whose number differs by `offset`, beginning with its channel `first`.
+  /// Adds the channels of lane_id() ^ offset, from its channel `first` on, cyclically.
   __device__ void add_from_lane(int offset, int first) {
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
@@ -90,7 +75,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
     }
   }
-  /// The scalar product with one number per channel, for this lane's own pixel.
+  /// Of the own pixel, with a number per channel.
   __device__ float dot(const float (&own)[kOwn]) const {
     float parts[kPixels];
 #pragma unroll
@@ -99,15 +84,17 @@ template <int C> struct ChannelShare {
 #pragma unroll
       for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
     }
-    return gather(parts);
+    float sum = parts[0];
+#pragma unroll
+    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
+    return sum;
   }
   __device__ float dot(const Eighth<C> (&splat)[8]) const {
     float own[kOwn];
     read(splat, own);
     return dot(own);
   }
-  /// The sum over all pixels times their weights (`weight`: of this lane's own pixel). The lane gets the sum of channel
-  /// summed_channel(). Lanes trade halves of the channels; the first trade has no choice to make.
+  /// The sum over all pixels, times `weight` of the own pixel: of channel summed_channel() in this lane.
   __device__ float weighted_sum(float weight) const {
     static_assert(kOwn == 2 || kOwn == 8);
     float weights[kPixels], sums[kOwn];
@@ -130,26 +117,23 @@ template <int C> struct ChannelShare {
       }
       count /= 2;
 #pragma unroll
-      for (int k = 0; k < count; ++k) {
-        const float keep = upper ? sums[k + count] : sums[k], give = upper ? sums[k] : sums[k + count];
-        sums[k] = keep + __shfl_xor_sync(kAllLanes, give, offset);
-      }
+      for (int k = 0; k < count; ++k) sums[k] = sum_of_pair(sums[k], sums[k + count], upper, offset);
     }
     return sums[0];
   }
-  /// The channel whose sum this lane gets, and whether it is the first lane that gets it.
+  /// Of weighted_sum(): the channel of this lane, and whether the lane is the first with it.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
 
-/// Channels [first, first + C) of kBatch splats; zeros where there are fewer.
+/// Channels [first, first + C) of kBatch splats, then zeros.
 template <int kBatch, int C> struct GroupChannels {
   int32_t ids[kBatch];
   Eighth<C> values[kBatch][8];
 
-  /// A lane per channel. `reach` and `ids` of the first `count` rows must be known to all threads.
+  /// A lane per channel. All threads must know `reach` and `ids`.
   __device__ void load(const Channels<float>& channels, int first, int count, const uint8_t* reach) {
-    constexpr int kAhead = 4;  // loads before stores, so that they wait together
+    constexpr int kAhead = 4;  // loads that wait together
     constexpr int kRows = kBlendThreads / C;
     const int c = threadIdx.x % C;
     const bool used = first + c < channels.count;
@@ -172,7 +156,7 @@ template <int kBatch, int C> struct GroupChannels {
 template <class F, int C>
 inline constexpr int kGroupBlocks = blocks_per_sm(group_blocks(F::kSamples, C == kSmallGroup), kBlendThreads);
 
-/// Groups of C channels: block (tile, g) has the channels from first_group + g C on. `F`: what a lane blends.
+/// Block (tile, g) has channels [first_group + g C, first_group + (g + 1) C). F: what a lane blends.
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_kernel(const BlendParams params, int first_group) {
@@ -186,34 +170,26 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane);
   const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane));
-  float transmittance[S];
   Share sums = {};
-  int last[S];
-#pragma unroll
-  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, last[s] = 0;
-  const auto open = [&] {
-    bool any = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
-    return any;
-  };
-  for (int k = 0; k < list.count && __syncthreads_or(open()); k += kGroupBatch) {
+  PixelState<S, 0, 1> state;
+  state.start(pixel.inside);
+  for (int k = 0; k < list.count && __syncthreads_or(state.open()); k += kGroupBatch) {
     const int count = stage.load(params.splats, params.channels, list, k, list.count);
     if (int(threadIdx.x) < count) staged.ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     staged.load(params.channels, first, count, stage.reach);
     __syncthreads();
     for (int from = 0; from < count; from += 32) {
-      if (!__any_sync(kAllLanes, open())) break;
+      if (!__any_sync(kAllLanes, state.open())) break;
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
         TileSplatRef<F, 0> splat = stage.splats[j];
         float contribution = 0;
 #pragma unroll
         for (int s = 0; s < S; ++s) {
-          const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), transmittance[s]);
+          const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
           contribution += b.contribution;
-          last[s] = b.mask ? k + j + 1 : last[s];
+          state.last[s] = b.mask ? k + j + 1 : state.last[s];
         }
         if (!__any_sync(kAllLanes, contribution > 0)) continue;
         sums.add(contribution, staged.values[j]);
@@ -223,10 +199,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   float through = 0;
 #pragma unroll
   for (int s = 0; s < S; ++s) {
-    through += abs(transmittance[s]);
+    through += abs(state.transmittance[s]);
     if (first == 0 && params.transmittance && pixel.inside) {
-      params.transmittance[sample_index<F>(pixel, s)] = abs(transmittance[s]);
-      params.last[sample_index<F>(pixel, s)] = last[s];
+      params.transmittance[sample_index<F>(pixel, s)] = abs(state.transmittance[s]);
+      params.last[sample_index<F>(pixel, s)] = state.last[s];
     }
   }
   through = sum_of_pixel<F>(through);
@@ -250,7 +226,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
-/// The parameters, with the three colours in the splats as rows of channels.
+/// With the colours in the splats as rows of channels.
 template <class Params> Params with_channels(Params p) {
   if (!p.channels.data) p.channels = {p.splats + kSplatColor, kSplatWidth, nullptr, 3};
   return p;

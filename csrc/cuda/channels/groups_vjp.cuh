@@ -1,36 +1,33 @@
-// Kernel blend_groups_vjp: the backward pass for any number of channels, one group after the other. A block per tile, a
-// warp per subtile, a pixel (or a sample of a Spread) per lane, back to front through the whole list; lanes share the
-// channels as in groups.cuh. It reads `last`, `transmittance` and the gradient of the image, and writes rows of
-// pair_grads and channel_sums. blend_vjp_channels (channels/blend_vjp.cu) launches it.
+// Kernel blend_groups_vjp: the backward pass for any number of channels, one group after the other.
+// channels/blend_vjp.cu launches it. A block per tile, a warp per subtile, walks the list back to front; lanes share
+// channels as in groups.cuh. It reads lists, splats, channels, `last`, `transmittance` and gradients of images, and
+// writes pair_grads and channel_sums.
 //
-// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair, which a single
-// block owns. Only MeanSums need all channels at once: where they are wanted, the first group makes all sums of shapes,
-// and reads the channels of the other groups from memory.
+// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
+// for them the first group makes all sums of shapes, and reads the channels of all groups.
 #pragma once
 
 #include "cuda/channels/groups.cuh"
 
 namespace ar::cuda {
 
-/// Sums of a pair besides its channels: PairGrad, and MeanSums.
+/// Sums of a pair besides channels: PairGrad and MeanSums.
 inline constexpr int kShapeSums = 8;
 
-/// What a block keeps in shared memory.
 template <class F, int C> struct GroupVjpShared {
   static constexpr int kBatch = group_vjp_batch(C == kSmallGroup);
 
   TileSplat<F, 0> splats[kBatch];
   GroupChannels<kBatch, C> channels;
-  float sums[kSubtiles][kBatch][C + kShapeSums];  ///< of a warp's pixels
-  uint32_t hits[kSubtiles][kBatch / 32];          ///< splats that have sums of a warp
+  float sums[kSubtiles][kBatch][C + kShapeSums];  ///< of a warp
+  uint32_t hits[kSubtiles][kBatch / 32];          ///< splats with sums of a warp
   int32_t rows[kBatch];
   Mat2<float> mean_maps[kBatch];
-  int last[kSubtiles];  ///< number of pairs up to the last that a subtile composited
+  int last[kSubtiles];  ///< pairs up to the last that a subtile composited
   uint8_t reach[kBatch];
 };
 
-/// The gradient with respect to one of the samples of this lane's pixels, in its channels of the group that begins with
-/// channel `first`.
+/// Of one sample of this lane's pixels, in its channels of the group from `first` on.
 template <class F, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
@@ -44,8 +41,7 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
   return g;
 }
 
-/// A block per tile, for channels [first, first + C). `F`: what a lane blends; `kWithShape`: makes the sums of shapes
-/// too, else only those of channels.
+/// Channels [first, first + C). F: what a lane blends. kWithShape: makes sums of shapes too.
 template <class F, int C, bool kWithShape>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
@@ -74,7 +70,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   int end = 0;  // pairs up to the last that any pixel composited
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) end = max(end, shared.last[b]);
-  // Pairs that nothing reached. A later group of the same width finds the zeros of the first.
+  // Pairs that nothing reached. Later groups of one width find the zeros of the first.
   if ((first == 0 || C == kSmallGroup) && !list.of_patch) {
     for (int k = end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
       clear_pair_together<C>(params, list.slot(k), first == 0);
@@ -96,21 +92,19 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   if (all_at_once) {
     for (int c = C; c < channel_count; ++c) through += gradient(c) * params.background[c];
   }
-  // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
+  // Alpha is 1 - transmittance: like a channel whose background is -1.
   if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
-  float transmittance[S], farther[S];  // after the list: `farther` as in blend_sample_vjp
+  float transmittance[S], farther[S];  // as in blend_sample_vjp, after the list
 #pragma unroll
   for (int s = 0; s < S; ++s) {
     transmittance[s] = pixel.inside ? params.transmittance[sample_index<F>(pixel, s)] : 1;
     farther[s] = through;
   }
-  // The splat of this thread in the batch that ends at k1, for the threads that there are splats for.
+  // The splat of this thread in the batch that ends at k1, or -1.
   const auto splat_of_batch = [&](int k1) {
     const int k = max(k1 - kBatch, 0) + int(threadIdx.x);
     return threadIdx.x < kBatch && k < k1 ? list.splat(k) : -1;
   };
-  // The staged splats in [from, from + 32) that reach this warp's subtile.
-  const auto reached = [&](int from) { return __ballot_sync(kAllLanes, shared.reach[from + lane] >> warp & 1); };
   int id = splat_of_batch(end);
   for (int k1 = end; k1 > 0; k1 -= kBatch) {
     const int k0 = max(k1 - kBatch, 0), count = k1 - k0;
@@ -136,13 +130,13 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
       shared.channels.load(params.channels, first, count, shared.reach);
       __syncthreads();
     }
-    if (next_id >= 0) {  // so that the next batch need not wait for memory
+    if (next_id >= 0) {
       prefetch_splat(params.splats, next_id);
       if (kWithShape) prefetch(params.channels.row(next_id) + first);
     }
     id = next_id;
     for (int part = kBatch / 32 - 1; part >= 0; --part) {
-      uint32_t hits = 0, mask = reached(32 * part);
+      uint32_t hits = 0, mask = __ballot_sync(kAllLanes, shared.reach[32 * part + lane] >> warp & 1);
       while (mask != 0) {
         const int bit = 31 - __clz(mask), j = 32 * part + bit;
         mask ^= 1u << bit;
@@ -216,23 +210,18 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
-/// The group that begins with channel `first`.
-template <class F> void launch_blend_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+template <class F, int C> void launch_group_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  const LaunchShape blocks = {unsigned(p.grid.tiles()), kBlendThreads, sizeof(GroupVjpShared<F, C>)};
   const bool with_shape = p.mean_sums == MeanSums::kNone || first == 0;
-  const auto launch_group = [&](auto channels, auto shape) {
-    constexpr int C = decltype(channels)::value;
-    const LaunchShape blocks = {unsigned(p.grid.tiles()), kBlendThreads, sizeof(GroupVjpShared<F, C>)};
-    launch(blend_groups_vjp_kernel<F, C, decltype(shape)::value>, blocks, stream, p, first);
-  };
-  const auto launch_width = [&](auto channels) {
-    if (with_shape) return launch_group(channels, std::true_type());
-    launch_group(channels, std::false_type());
-  };
+  const auto kernel = with_shape ? blend_groups_vjp_kernel<F, C, true> : blend_groups_vjp_kernel<F, C, false>;
+  launch(kernel, blocks, stream, p, first);
+}
+template <class F> void launch_blend_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   if constexpr (!F::kGeneric) {
     if (group_width<F>(p.channels.count - first) == kSmallGroup)
-      return launch_width(std::integral_constant<int, kSmallGroup>());
+      return launch_group_vjp<F, kSmallGroup>(p, first, stream);
   }
-  launch_width(std::integral_constant<int, kChannelGroup>());
+  launch_group_vjp<F, kChannelGroup>(p, first, stream);
 }
 
 }  // namespace ar::cuda

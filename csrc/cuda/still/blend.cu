@@ -1,20 +1,33 @@
-// Launches the forward kernels of footprints whose samples stay, for up to four channels. dispatch.cu calls
-// blend_still().
+// Launches the forward kernels of footprints whose samples stay. dispatch.cu calls blend_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"
+#include "cuda/still/tail.cuh"
 
 namespace ar::cuda {
+namespace {
+
+template <class F, int C, bool kKeep> void launch_kernels(const BlendParams& p, cudaStream_t stream) {
+  constexpr int S = F::kSamples;
+  const unsigned blocks = kBlocksPerSm * multiprocessors();
+  const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
+  launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
+  launch(tail_through_kernel<F>, of_chunks, stream, p);
+  launch(tail_scan_kernel, of_parts, stream, p, S);
+  launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
+  launch(tail_sum_kernel<LaneSamples<S, F::kLanes>, C, kKeep>, of_sums, stream, p);
+}
+template <class F, int C> void launch_blend(const BlendParams& p, cudaStream_t stream) {
+  if (p.transmittance) return launch_kernels<F, C, true>(p, stream);
+  launch_kernels<F, C, false>(p, stream);
+}
+
+}  // namespace
 
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (family_of<F>(kFewChannels) == Family::kStill) {
-      with_lanes<F>(p.grid, [&](auto of_lane) {
-        using OfLane = decltype(of_lane);
-        if (!p.channels.data) return launch_blend_few<OfLane, 3>(p, stream);
-        launch_blend_few<OfLane, kFewChannels>(p, stream);
-      });
-    }
+  visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
+    using F = decltype(of_lane);
+    if (!p.channels.data) return launch_blend<F, 3>(p, stream);
+    launch_blend<F, kFewChannels>(p, stream);
   });
 }
 

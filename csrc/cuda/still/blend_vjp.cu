@@ -1,20 +1,27 @@
-// Launches the backward kernel of footprints whose samples stay, for up to four channels. dispatch.cu calls
-// blend_vjp_still().
+// Launches the backward kernel of footprints whose samples stay. dispatch.cu calls blend_vjp_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/vjp.cuh"
 
 namespace ar::cuda {
+namespace {
+
+template <class F, int C, bool kMeans> void launch_kernel(const BlendVjpParams& p, cudaStream_t stream) {
+  constexpr int kWarps = vjp_warps(F::kSamples);
+  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksPerSm * multiprocessors());
+  launch(blend_vjp_kernel<F, C, kMeans>, {blocks, 32 * kWarps, sizeof(VjpShared<F, C>)}, stream, p);
+}
+template <class F, int C> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
+  if (p.mean_sums == MeanSums::kNone) return launch_kernel<F, C, false>(p, stream);
+  launch_kernel<F, C, true>(p, stream);
+}
+
+}  // namespace
 
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (family_of<F>(kFewChannels) == Family::kStill) {
-      with_lanes<F>(p.grid, [&](auto of_lane) {
-        using OfLane = decltype(of_lane);
-        if (!p.channels.data) return launch_blend_vjp_few<OfLane, 3>(p, stream);
-        launch_blend_vjp_few<OfLane, kFewChannels>(p, stream);
-      });
-    }
+  visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
+    using F = decltype(of_lane);
+    if (!p.channels.data) return launch_blend_vjp<F, 3>(p, stream);
+    launch_blend_vjp<F, kFewChannels>(p, stream);
   });
 }
 

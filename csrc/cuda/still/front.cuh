@@ -1,37 +1,30 @@
-// Kernel blend_front: the forward pass of footprints whose samples stay at their nodes, for up to four channels. It
-// reads lists, splats and the plan (plan.cuh), and writes images, transmittance, `last` and checkpoints. blend_still
-// (still/blend.cu) launches it and the kernels of tail.cuh after it.
+// Kernel blend_front: the forward pass of footprints whose samples stay, for up to four channels. still/blend.cu
+// launches it, then the kernels of tail.cuh. They read lists, splats and the plan (plan.cuh), and write images,
+// checkpoints, `transmittance` and `last`.
 //
-// The list of a tile is cut into chunks: the first few are the front, the others the tail. Five kernels blend them:
+// The first chunks of a list are the front, the others the tail:
 //
-//   blend_front    a block per tile composites the chunks of the front in order, until all pixels have stopped. If some
-//                  are open after the front and pairs are left, the next kernels finish the tile
-//   tail_through   a block per chunk of the tail finds how much light the chunk alone lets through
-//   tail_scan      multiplies these numbers up to the transmittance at the begin of each chunk
-//   tail_blend     a block per chunk composites it, exactly as if the chunks before had just been composited
-//   tail_sum       adds up the chunks
+//   `blend_front`    composites the front, until all pixels have stopped. A block per tile.
+//   `tail_through`   finds how much light each chunk of the tail lets through, if pixels are open. A block per chunk.
+//   `tail_scan`      multiplies these numbers up to the transmittance at the begin of each chunk.
+//   `tail_blend`     composites each chunk from this transmittance on. A block per chunk.
+//   `tail_sum`       adds the chunks up.
 //
-// Chunks of the tail are blended side by side, so that a few tiles with long lists, as in small images of large scenes,
-// fill the device too. The picture has the same bits with and without a backward pass. For a backward pass (kKeep) a
-// checkpoint at the end of each chunk stores the transmittance and the channels of every sample.
+// So a few tiles with long lists fill the device too. The picture has the same bits with and without a backward pass.
 #pragma once
 
 #include "cuda/launch.cuh"
 #include "cuda/still/output.cuh"
 #include "cuda/still/stage.cuh"
-#include "cuda/still/tail.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-template <class F, int C>
-inline constexpr int kFrontBlocks =
-    blocks_per_sm(front_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, C>)), kBlendThreads);
-
-/// A block per tile. `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kKeep`: stores what
-/// the backward pass needs.
+/// A block per tile. F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kKeep: for a backward
+/// pass.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(front_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+    blend_front_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = kChunkLength, kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
@@ -67,7 +60,9 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
     params.tile_open[tile] = more;
     if (more) params.open_tiles[atomicAdd(&counts.open_tiles, 1)] = tile;
   }
-  if (kKeep) store_last<F>(params, pixel, state.last);
+#pragma unroll
+  for (int s = 0; s < S; ++s)
+    if (kKeep && pixel.inside) params.last[sample_index<F>(pixel, s)] = state.last[s];
   if (!more) {
     total += state.total();
     store_pixel<F>(params, pixel, total, state.transmittance);
@@ -81,28 +76,10 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
       }
     }
   } else if constexpr (!kKeep) {
-    // The tail goes on from the last front chunk's checkpoint.
+    // The tail begins at the checkpoint of the last front chunk.
 #pragma unroll
     for (int s = 0; s < S; ++s) checkpoints.transmittance(front_length - 1, s) = state.transmittance[s];
     checkpoints.set_total(front_length - 1, total);
-  }
-}
-
-template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
-  constexpr int S = F::kSamples;
-  const unsigned blocks = kBlocksPerSm * multiprocessors();  // of the tail, which share its work
-  const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
-  launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
-  launch(tail_through_kernel<F>, of_chunks, stream, p);
-  launch(tail_scan_kernel, of_parts, stream, p, S);
-  launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
-  launch(tail_sum_kernel<LaneSamples<S, F::kLanes>, C, kKeep>, of_sums, stream, p);
-}
-template <class F, int C> void launch_blend_few(const BlendParams& p, cudaStream_t stream) {
-  if (p.transmittance) {
-    launch_blend<F, C, true>(p, stream);
-  } else {
-    launch_blend<F, C, false>(p, stream);
   }
 }
 

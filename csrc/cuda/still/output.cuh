@@ -1,19 +1,17 @@
-// A library for the forward kernels of footprints whose samples stay (front.cuh, tail.cuh): what they store. That is
-// checkpoints at the ends of chunks, for the tail and for the backward pass, and the finished pixels of the images.
+// A library for the kernels of front.cuh and tail.cuh: addresses of checkpoints, and the pixels of the images.
 #pragma once
 
 #include "cuda/tile.cuh"
 
 namespace ar::cuda {
 
-/// Chunks of the front of each tile.
 __device__ inline int front_of(const BlendParams& params) {
   return front_chunks(params.grid, params.lists.counts->pairs, params.plan.blocks_at_once);
 }
 
-/// The checkpoints of a pixel of a tile, in the layout of CheckpointLayout.
+/// The checkpoints (CheckpointLayout) of a pixel of a tile. S samples, C channels.
 template <int S, int C, bool kKeep> struct PixelCheckpoints {
-  float* base;  ///< of the tile's first plane
+  float* base;  ///< first plane of the tile
   int first_chunk, pixel;
 
   __device__ PixelCheckpoints(const BlendParams& params, int tile, int pixel)
@@ -24,7 +22,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   __device__ Checkpoint<C>& kept(int chunk, int s) const {
     return reinterpret_cast<Checkpoint<C>*>(base)[(int64_t(chunk) * S + s) * kTilePixels + pixel];
   }
-  /// Plane k of a chunk without a backward pass: transmittance of every sample, then the channels.
+  /// Without kKeep: plane k of a chunk, transmittance of every sample, then channels.
   __device__ float& plane(int chunk, int k) const {
     return base[(int64_t(chunk - first_chunk) * (S + C) + k) * kTilePixels + pixel];
   }
@@ -36,7 +34,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
       return plane(chunk, s);
     }
   }
-  /// Channels of a sample or, without a backward pass, of all.
+  /// Of a sample; without kKeep of all samples.
   __device__ Values<C> channels(int chunk, int s) const {
     if constexpr (kKeep) {
       return kept(chunk, s).channels;
@@ -53,8 +51,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   }
 };
 
-/// The transmittance of a pixel in the checkpoints, with or without a backward pass: for kernels that are compiled once
-/// for any number of channels.
+/// The same for kernels that are compiled once for all S, C and kKeep: only the transmittance.
 struct TransmittancePlanes {
   float* base;
   int first_chunk;
@@ -82,8 +79,8 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a pixel whose samples are complete to the images; `total`: the sum of their channels. `Samples`: a footprint
-/// or LaneSamples. All lanes of a warp must call it.
+/// Writes a complete pixel to the images. `total`: the channels of its samples in this lane. Samples: a footprint or
+/// LaneSamples. All lanes must call it.
 template <class Samples, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
                             const float (&transmittance)[Samples::kSamples]) {
@@ -106,16 +103,9 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> to
   }
   if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
-template <class F> __device__ void store_last(const BlendParams& params, Pixel pixel, const int (&last)[F::kSamples]) {
-  if (!pixel.inside) return;
-#pragma unroll
-  for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
-}
 
-/// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the
-/// channels of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.
-/// `farther`: the channels of what is farther than all of them. kBatch chunks are loaded before the first store, so
-/// that the loads wait for memory together.
+/// Replaces the channels of each chunk in [first, end) by the channels of everything farther, where blend_vjp starts.
+/// `farther`: beyond the last of these chunks. kBatch chunks are loaded before the first store, to wait together.
 template <int kBatch, int S, int C>
 __device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
                                    Values<C> farther) {

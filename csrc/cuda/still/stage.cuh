@@ -1,5 +1,5 @@
-// A library for the forward kernels of footprints whose samples stay (front.cuh, tail.cuh): the state that a pixel
-// carries from splat to splat, the splats that a block stages, and how a batch of them is composited.
+// A library for the kernels of front.cuh and tail.cuh: splats that a block stages, lists of those that reach each
+// warp's pixels, and compositing.
 #pragma once
 
 #include <type_traits>
@@ -9,89 +9,46 @@
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one
-/// for all samples, or one per sample where checkpoints need it.
-template <int S, int C, int kSets> struct PixelState {
-  float transmittance[S];
-  Values<C> channels[kSets];
-  int last[S];
-
-  __device__ void start(bool open) {
-#pragma unroll
-    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
-    clear_channels();
-  }
-  __device__ void clear_channels() {
-#pragma unroll
-    for (int k = 0; k < kSets; ++k) channels[k] = {};
-  }
-  __device__ Values<C> total() const {
-    Values<C> sum = channels[0];
-#pragma unroll
-    for (int k = 1; k < kSets; ++k) sum += channels[k];
-    return sum;
-  }
-  __device__ bool open() const {
-    bool any = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
-    return any;
-  }
-};
-
-/// The splats that a block blends together, and lists of those that reach each warp's pixels.
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   static constexpr int kBatch = kBlendThreads;
-  /// With one sample, where little else is done for a splat, a list holds offsets in memory and is read four at a time.
-  /// With more samples it holds numbers of splats.
+  /// Whether lists have offsets in memory, read four at once: only with one sample, where this is much of the work.
   static constexpr bool kOffsets = F::kSamples == 1;
   using Lists = std::conditional_t<kOffsets, ReachLists<uint32_t, sizeof(TileSplat<F, C>), 4, kSubtiles, kBatch>,
                                    ReachLists<uint8_t, 1, 1, kSubtiles, kBatch>>;
   Lists lists;
 
-  /// Lists the staged splats, `count` of them, that reach this warp's pixels, and returns the length of the list. All
-  /// lanes must call it.
+  /// Lists the `count` staged splats that reach this warp's pixels, and returns how many do. All lanes must call it.
   __device__ int list_reached(int count) { return lists.list(this->reach, 0, count); }
-  /// Calls visit(splat, entry) for the splats [from, to) of the list.
   template <class Visit> __device__ __forceinline__ void for_each_listed(int from, int to, Visit&& visit) const {
     lists.for_each(from, to, [&](auto entry) { visit(Lists::splat_of(this->splats, entry), entry); });
   }
 };
 
-/// Composites a splat into a pixel; last[s] becomes `index` where it was composited into sample s.
-template <class F, int C, int kSets>
-__device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<float> p, int index,
-                                          PixelState<F::kSamples, C, kSets>& state, int (&last)[F::kSamples]) {
-  const auto composite_sample = [&](int s) {
-    const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
-    last[s] = b.mask ? index : last[s];
-    return b;
-  };
-  if constexpr (kSets == 1) {
-    add_samples<F::kSamples>(state.channels[0], splat.channels, composite_sample);
-  } else {
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s) {
-      const Blended<float> b = composite_sample(s);
-      if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
-    }
-  }
-}
-
-/// Composites the staged splats into a pixel; `index`: the number of the first of them in the tile's list.
+/// Composites the staged splats into a pixel. `index`: of the first in the tile's list.
 template <class F, int C, int kSets>
 __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec2<float> p,
                               PixelState<F::kSamples, C, kSets>& state) {
   using Stage = BlendStage<F, C>;
   const int reached = stage.list_reached(count);
-  int entries[] = {-1};  // of the last splat of this batch that was composited, with kOffsets
+  int entries[F::kSamples] = {-1};  // of the last splat composited, if kOffsets
+  int (&last)[F::kSamples] = Stage::kOffsets ? entries : state.last;
+  const int first = Stage::kOffsets ? 0 : index + 1;
   for (int from = 0; from < reached; from += kBetweenVotes) {
     if (!__any_sync(kAllLanes, state.open())) break;
     stage.for_each_listed(from, min(reached, from + kBetweenVotes), [&](TileSplatRef<F, C> splat, auto entry) {
-      if constexpr (Stage::kOffsets) {
-        composite<F>(splat, p, int(entry), state, entries);
+      const auto composite = [&](int s) {
+        const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
+        last[s] = b.mask ? first + int(entry) : last[s];
+        return b;
+      };
+      if constexpr (kSets == 1) {
+        add_samples<F::kSamples>(state.channels[0], splat.channels, composite);
       } else {
-        composite<F>(splat, p, index + int(entry) + 1, state, state.last);
+#pragma unroll
+        for (int s = 0; s < F::kSamples; ++s) {
+          const Blended<float> b = composite(s);
+          if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
+        }
       }
     });
   }

@@ -1,5 +1,5 @@
-// The four kernels that finish the tiles that blend_front has left open; front.cuh has an overview and launches them.
-// They read the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, then the images.
+// Kernels that finish the tiles that blend_front has left open; front.cuh has an overview, still/blend.cu launches
+// them. They read lists, splats, the plan and `open_tiles`, and write checkpoints, `last` and images.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,19 +9,7 @@
 
 namespace ar::cuda {
 
-/// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
-template <class F, int C>
-__device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
-  const int reached = stage.list_reached(count);
-  stage.for_each_listed(0, reached, [&](TileSplatRef<F, C> splat, auto) {
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s)
-      transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
-  });
-}
-
-/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks
-/// share them.
+/// Calls visit(chunk, its list, its end in the list) for this block's tail chunks of open tiles.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -33,13 +21,11 @@ template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const
   }
 }
 
+/// What each tail chunk alone lets through, without a threshold. F: what a lane blends.
 template <class F>
-inline constexpr int kThroughBlocks =
-    blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, 0>)), kBlendThreads);
-
-/// Writes to the checkpoints what each tail chunk alone lets through.
-template <class F>
-__global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads,
+                                  blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+    tail_through_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   __shared__ BlendStage<F, 0> stage;
@@ -52,7 +38,10 @@ __global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through
       __syncthreads();
       const int count = stage.load(params.splats, params.channels, list, k, end);
       __syncthreads();
-      pass_all<F>(stage, count, p, transmittance);
+      stage.for_each_listed(0, stage.list_reached(count), [&](TileSplatRef<F, 0> splat, auto) {
+#pragma unroll
+        for (int s = 0; s < S; ++s) transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
+      });
     }
     const TransmittancePlanes planes(params, S, tail.tile, int(threadIdx.x));
 #pragma unroll
@@ -60,9 +49,8 @@ __global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through
   });
 }
 
-/// A sample with less transmittance than this is stopped by the next splat that it meets, since alpha is at least
-/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of
-/// products of chunks, which differs from the rounding splat by splat.
+/// The next splat, with alpha >= kAlphaMin, stops a sample with less transmittance: it may count as stopped. The margin
+/// covers rounding, which differs between chunks and splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -70,12 +58,11 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
   return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
 }
 
-/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so
-/// that several multiprocessors read the checkpoints of a tile.
+/// Of 32 pixels, a block each.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
-/// Blocks share the parts of the open tiles. `samples`: of a lane.
+/// From what each chunk lets through to the transmittance at its begin, negative if the sample has stopped. `samples`:
+/// of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = kTailLoads;
@@ -96,7 +83,7 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
       float through[kBatch];
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) through[k] = next[k];
-      load(first + kBatch);  // before the stores, after which loads would wait
+      load(first + kBatch);  // after stores it would wait
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
         if (first + k >= chunks) break;
@@ -108,8 +95,8 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
   }
 }
 
-/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample
-/// had stopped before the chunk.
+/// Channels of each tail chunk and transmittance at its end: zero if the sample had stopped before. F, C, kKeep: as in
+/// blend_front.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
     tail_blend_kernel(const BlendParams params) {
@@ -153,20 +140,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks
 
 inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
 
-/// The tail chunks [first, end) of a warp.
-struct TailShare {
-  int first, end;
-
-  __device__ TailShare(int front, int chunks) {
-    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
-    first = min(front + int(threadIdx.x / 32) * share, chunks);
-    end = min(first + share, chunks);
-  }
-};
-
-/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum
-/// depends on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
-/// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
+/// Adds chunks up, and writes pixels. Samples: LaneSamples of what a
+/// lane blends. C, kKeep: as in blend_front.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
@@ -178,28 +153,31 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
-    TailShare share(front_of(params), chunks_of(params, tile));
-    if (warp == 0) share.first = checkpoints.first_chunk;
+    const int front = front_of(params), chunks = chunks_of(params, tile);
+    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
+    int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // of the warp's chunks
+    const int end = min(begin + share, chunks);
+    if (warp == 0) begin = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) {
       const bool has_channels = kKeep || s == 0;
       Values<C> sum = {};
-      float last = 0;  // at the end of the last of these chunks that the sample reached
-      for (int first = share.first; first < share.end; first += kBatch) {
+      float last = 0;  // transmittance after the last chunk that the sample reached
+      for (int first = begin; first < end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
           ends[k] = 0;
-          if (first + k >= share.end) continue;
+          if (first + k >= end) continue;
           if (has_channels) own[k] = checkpoints.channels(first + k, s);
           ends[k] = checkpoints.transmittance(first + k, s);
         }
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
-          if (has_channels && first + k < share.end) sum += own[k];
+          if (has_channels && first + k < end) sum += own[k];
           if (ends[k] != 0) last = ends[k];
         }
       }
@@ -219,7 +197,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
 #pragma unroll
           for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }
-        accumulate_farther<kBatch>(checkpoints, share.first, share.end, s, farther);
+        accumulate_farther<kBatch>(checkpoints, begin, end, s, farther);
       }
       __syncthreads();  // before the next sums
     }

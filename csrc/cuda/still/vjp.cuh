@@ -1,12 +1,8 @@
-// Kernel of blend_vjp for footprints whose samples stay at their nodes, for up to four channels. blend_vjp_still
-// (still/blend_vjp.cu) launches it.
+// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. still/blend_vjp.cu
+// launches it. It reads the plan and what vjp_walk.cuh names, and writes rows of pair_grads.
 //
-// A warp has a chunk of a tile's list, and goes through it back to front with all pixels of the tile, eight per lane.
-// Each pair is summed in one place, so that no atomics are needed, whose order would change from run to run.
-//
-//   vjp_pixels.cuh   the pixels of a lane, in registers or in shared memory
-//   vjp_sums.cuh     the splats that a warp has listed, and sums over its lanes
-//   vjp_walk.cuh     the chunk, the state of the pixels after it, and the way through its pairs
+// A warp goes through a chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp
+// makes the sums of a pair, without atomics, whose order would change from run to run.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -15,8 +11,8 @@
 
 namespace ar::cuda {
 
-/// A chunk back to front over all pixels of its tile. `item`: its number in the plan's order.
-template <class F, int C, Sums kSums>
+/// Walks chunk_order[item].
+template <class F, int C, bool kMeans>
 __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, SharedPixels<F, C>& shared,
                                                 VjpBatch<F, C>& batch) {
   LanePixels<F, C> pixels(shared);
@@ -29,26 +25,21 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
   if (chunk.begin >= tile_last) return;
   const auto* checkpoints =
       reinterpret_cast<const Checkpoint<C>*>(params.checkpoints + int64_t(chunk.plane) * kTilePixels);
-  ChunkWalk<F, C, kSums> walk(params, chunk, pixels, batch);
+  ChunkWalk<F, C, kMeans> walk(params, chunk, pixels, batch);
   start_pixels(params, chunk, checkpoints, tile_last <= chunk.end, pixels);
   walk.run(tile_last);
 }
 
-template <class F, int C>
-inline constexpr int kVjpBlocks =
-    blocks_per_sm(vjp_blocks(F::kSamples, kHoldsPixels<F, C>, kHoldsSamples<F, C>, sizeof(TileSplat<F, C>)),
-                  32 * vjp_warps(F::kSamples));
-
-/// What a block keeps in dynamic shared memory.
 template <class F, int C> struct VjpShared {
   SharedPixels<F, C> pixels[vjp_warps(F::kSamples)];
   VjpBatch<F, C> batches[vjp_warps(F::kSamples)];
 };
 
-/// `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kSums`: with MeanSums or without.
-/// A warp takes the next chunk when it is done with one, and does not wait for the others of its block.
-template <class F, int C, Sums kSums>
-__global__ void __launch_bounds__(32 * vjp_warps(F::kSamples), kVjpBlocks<F, C>)
+/// F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kMeans: with MeanSums. Each warp claims
+/// chunks until none is left.
+template <class F, int C, bool kMeans>
+__global__ void __launch_bounds__(32 * vjp_warps(F::kSamples),
+                                  blocks_per_sm(vjp_blocks(F::kSamples, F::kExpensive, C), 32 * vjp_warps(F::kSamples)))
     blend_vjp_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
   auto& shared = *reinterpret_cast<VjpShared<F, C>*>(dynamic_shared());
@@ -58,18 +49,8 @@ __global__ void __launch_bounds__(32 * vjp_warps(F::kSamples), kVjpBlocks<F, C>)
     if (lane_id() == 0) taken = atomicAdd(params.chunks_taken, 1);
     const int item = shuffle(taken, 0);
     if (item >= chunks) return;
-    blend_chunk_vjp<F, C, kSums>(params, item, shared.pixels[warp], shared.batches[warp]);
+    blend_chunk_vjp<F, C, kMeans>(params, item, shared.pixels[warp], shared.batches[warp]);
   }
-}
-
-template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
-  constexpr int kWarps = vjp_warps(F::kSamples);
-  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksPerSm * multiprocessors());
-  launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, sizeof(VjpShared<F, C>)}, stream, p);
-}
-template <class F, int C> void launch_blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
-  if (p.mean_sums == MeanSums::kNone) return launch_blend_vjp<F, C, Sums::kGrads>(p, stream);
-  launch_blend_vjp<F, C, Sums::kBoth>(p, stream);
 }
 
 }  // namespace ar::cuda

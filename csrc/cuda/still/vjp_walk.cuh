@@ -1,22 +1,19 @@
-// A warp of blend_vjp for footprints whose samples stay: its chunk, the state of the pixels after the chunk, and the
-// way back to front through the pairs. The kernel in still/vjp.cuh calls it. It reads the lists, splats, checkpoints,
-// `last`, `transmittance` and the gradient of the image, and writes rows of BlendVjpParams::pair_grads.
+// A library for the kernel of still/vjp.cuh: a warp of blend_vjp takes the pixels of a tile back to front through a
+// chunk. It reads lists, splats, checkpoints, `last`, `transmittance` and gradients of images, and writes rows of
+// pair_grads.
 #pragma once
 
 #include "cuda/still/vjp_sums.cuh"
 
 namespace ar::cuda {
 
-/// What the kernel sums for each pair: gradients, or gradients and MeanSums.
-enum class Sums { kGrads, kBoth };
-
-/// A warp's chunk: the pairs [begin, end) of a tile's list.
+/// Pairs [begin, end) of a tile's list.
 struct VjpChunk {
   TileList list;
   int begin, end;
   int plane;  ///< first plane of the chunk's checkpoints
   const TileGrid& grid;
-  int64_t image;     ///< how many pixels the image has
+  int64_t image;     ///< pixels of the image
   Vec2<float> size;  ///< of the image [px]
 
   __device__ __forceinline__ VjpChunk(const BlendVjpParams& params, TileChunk chunk)
@@ -28,7 +25,7 @@ struct VjpChunk {
         image(int64_t(grid.width) * grid.height),
         size({float(grid.width), float(grid.height)}) {}
 
-  /// The number in the image of a lane's pixel of subtile b; -1 outside of the image.
+  /// Of a lane's pixel of subtile b; -1 outside of the image.
   template <class F> __device__ int64_t pixel_index(int b, int lane) const {
     const Vec2<float> p = pixel_of<F>(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -36,8 +33,8 @@ struct VjpChunk {
   }
 };
 
-/// The number of pairs of the tile's list up to the last that was composited into any of its pixels. The numbers of the
-/// subtiles are written to batch.subtile_last, for all lanes to read after the next __syncwarp().
+/// Pairs of the list up to the last that any pixel composited. Also writes batch.subtile_last; __syncwarp() must
+/// follow.
 template <class F, class Batch>
 __device__ __forceinline__ int find_last(const BlendVjpParams& params, const VjpChunk& chunk, Batch& batch) {
   const int lane = lane_id();
@@ -55,9 +52,8 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
   return tile_last;
 }
 
-/// Sets the pixels and their samples to their state after the chunk. `final`: no pixel has composited a later splat, so
-/// that only the background follows; else the state is in `checkpoints`, [samples, kTilePixels] at the end of the
-/// chunk.
+/// The state of pixels and samples after the chunk. `final`: only the background follows. checkpoints: [samples,
+/// kTilePixels] after the chunk.
 template <class F, int C>
 __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const VjpChunk& chunk,
                                              const Checkpoint<C>* checkpoints, bool final, LanePixels<F, C>& pixels) {
@@ -92,7 +88,7 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
         transmittance = abs(c.transmittance);
         behind = dot(g, c.channels) / transmittance;
       }
-      // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
+      // Alpha is 1 - transmittance: like a channel whose background is -1.
       if (params.dL_dalpha && i >= 0) {
         const float open = final ? 1 : params.transmittance[sample_index<F>(chunk.image, i, s)] / transmittance;
         behind -= scale * params.dL_dalpha[i] * open;
@@ -103,18 +99,14 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   }
 }
 
-/// Takes the pixels of a tile back to front through the pairs of a chunk, and sums over them what each pair gives.
-template <class F, int C, Sums kSums> class ChunkWalk {
+/// F: what a lane blends. C: channels. kMeans: with MeanSums.
+template <class F, int C, bool kMeans> class ChunkWalk {
  public:
-  using Batch = VjpBatch<F, C>;
-  using Pixels = LanePixels<F, C>;
-
-  __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, Pixels& pixels,
-                                       Batch& batch)
+  __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, LanePixels<F, C>& pixels,
+                                       VjpBatch<F, C>& batch)
       : params_(params), chunk_(chunk), list_(chunk.list), pixels_(pixels), batch_(batch) {}
 
-  /// Goes through the whole chunk, in batches of 32 pairs: lists the pairs that reach a pixel, then takes the pixels
-  /// through them. `tile_last`: of find_last().
+  /// In batches of 32 pairs: lists pairs that reach a pixel, then walks them. `tile_last`: of find_last().
   __device__ __forceinline__ void run(int tile_last) {
     static_assert(kChunkLength % 32 == 0);  // no batch begins before the chunk
     for (int k1 = min(chunk_.end, tile_last); k1 > chunk_.begin; k1 = (k1 - 1) / 32 * 32) {
@@ -122,7 +114,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       uint32_t reach = 0;
       Mat2<float> mean_map = {0, 0, 0, 0};
       __syncwarp();  // all have read the last batch
-      // A lane for each pair. Not in a function of its own, with which some kernels get more instructions.
+      // A lane per pair. As a function it takes more instructions.
       Splat<F, float> own;
       int32_t id = 0, row = 0;
       if (k < k1) {
@@ -142,7 +134,6 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       }
       const int listed = __popc(reaching);
       __syncwarp();
-      // Which MeanSums is known to the compiler, since pixels must not branch on it.
       if constexpr (!kMeans) {
         walk_listed<MeanSums::kNone>(k0, listed, mean_map);
       } else if (params_.mean_sums == MeanSums::kNorm) {
@@ -155,13 +146,9 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 
  private:
   static constexpr int S = F::kSamples, kSumCount = 6 + C;
-  static constexpr bool kMeans = kSums == Sums::kBoth;
-  /// Whether the sums of several pairs are added up together, by PairSums.
-  static constexpr bool kPairSums = kHoldsSamples<F, C>;
-  using SplatInUse = ListedSplatRef<F, C>;
+  static constexpr bool kPairSums = kHoldsSamples<C>;
 
-  /// Takes the pixels through the listed splats, the first of which is the last of the tile's list. The batch begins
-  /// with pair k0; `mean_map`: of the lane's own pair, for MeanSums.
+  /// Farthest first. k0: first pair of the batch. `mean_map`: of the lane's own pair.
   template <MeanSums kKind> __device__ void walk_listed(int k0, int listed, const Mat2<float>& mean_map) {
     if constexpr (kPairSums) {
       for (int n = 0; n < listed; n += PairSums::kPairs) {
@@ -176,12 +163,11 @@ template <class F, int C, Sums kSums> class ChunkWalk {
     }
   }
 
-  /// Takes the pixels that a listed splat reaches through it, and sums over them. `to`: the PairSums::Pair for its
-  /// values, or its number in the list.
+  /// Takes pixels through a splat. `to`: a PairSums::Pair, or the index in the list.
   template <MeanSums kKind, class To>
   __device__ void walk(const ListedSplat<F, C>& listed, int k0, const Mat2<float>& mean_map, To&& to) {
-    SplatInUse splat = listed;
-    // By a ballot, so that the compiler knows that all lanes branch alike.
+    const ListedSplat<F, C> splat = listed;
+    // A ballot tells the compiler that all lanes branch alike.
     const uint32_t reached = __ballot_sync(kAllLanes, splat.reach_and_index & subtile_bit_);
     const int j = int(splat.reach_and_index >> 27), at = k0 + j;
     const Mat2<float> m =
@@ -199,16 +185,17 @@ template <class F, int C, Sums kSums> class ChunkWalk {
     put_grads(row, shape, weighted, channels, to);
     if constexpr (kMeans) {
       const float total = warp_sum_of_two(means.x, means.y);
-      if (lane_ % 16 == 0) put(row, kPairMeans + lane_ / 16, total);
+      if (lane_ % 16 == 0)
+        put_sum(params_.pair_grads, kPairGradWidth, list_.of_patch, row, kPairMeans + lane_ / 16, total);
     }
   }
 
-  /// Takes the lane's pixel of subtile b, at p, from after a splat to before it, and adds to the lane's sums: `shape`,
-  /// and `means` of MeanSums. `at`: the splat's index in the tile's list, by reference because the
-  /// compiler else turns comparisons with it around.
+  /// Takes the pixel of subtile b, at p, from after a splat to before it. `at`: the pair, by reference because the
+  /// compiler else turns comparisons around.
   template <MeanSums kKind>
-  __device__ void add_pixel(const SplatInUse& splat, const int& at, const Mat2<float>& mean_map, int b, Vec2<float> p,
-                            ShapeGrad<float>& shape, float& weighted, Values<C>& channels, Vec2<float>& means) {
+  __device__ void add_pixel(const ListedSplat<F, C>& splat, const int& at, const Mat2<float>& mean_map, int b,
+                            Vec2<float> p, ShapeGrad<float>& shape, float& weighted, Values<C>& channels,
+                            Vec2<float>& means) {
     const float4 g = pixels_.gradient(b);
     const Values<4> of_pixel_g = {{g.x, g.y, g.z, g.w}};
     float g_color = madd(g.x, splat.channels.v[0], madd(g.y, splat.channels.v[1], g.z * splat.channels.v[2]));
@@ -218,14 +205,14 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 #pragma unroll
     for (int s = 0; s < S; ++s) {
       const float alpha = F::alpha(splat.terms, p, s);
-      // Both are worked out: to read the second only after the first would be to wait for it.
+      // `&`, because to read `last` after the first comparison would be to wait.
       const bool mask = (alpha >= float(kAlphaMin)) & (at < pixels_.last_of(s, b, g));
       if (s == 0 && S == 1 && !kTakesTwo<F, C> && !__any_sync(kAllLanes, mask)) break;
       VjpSample sample = pixels_.sample(s, b);
       const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
       pixels_.sample(s, b) = sample;
       F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, shape);
-      // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+      // Again for the pixel alone: MeanSums must not change a bit of the other sums.
       if (kMeans) F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, of_pixel);
       contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
       weighted += grad.of_alpha.weighted;
@@ -239,12 +226,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
     }
   }
 
-  /// Writes a sum of a pair.
-  __device__ void put(int32_t row, int column, float x) {
-    put_sum(params_.pair_grads, kPairGradWidth, list_.of_patch, row, column, x);
-  }
-
-  /// Adds the lanes' sums up and writes them to the pair's row, or leaves them at `to` for sum_pairs().
+  /// Sums over lanes into the row of the pair, or stores values at `to` for sum_pairs().
   template <class To>
   __device__ __forceinline__ void put_grads(int32_t row, ShapeGrad<float> shape, float weighted,
                                             const Values<C>& channels, To& to) {
@@ -257,14 +239,14 @@ template <class F, int C, Sums kSums> class ChunkWalk {
     } else {
       const float sum = sum_values(values);
       if (!list_.of_patch) {
-        sums_[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
+        sums_[int64_t(row) * kPairGradWidth] = sum;  // by all lanes: to choose some takes longer
       } else if (has_value_first<kSumCount>(lane_)) {
         atomicAdd(&sums_[int64_t(row) * kPairGradWidth], sum);
       }
     }
   }
 
-  /// Adds up the values that the lanes have left for `count` listed splats, from number `from` on.
+  /// Sums the stored values of `count` listed splats from `from` on.
   __device__ void sum_pairs(int from, int count) {
     __syncwarp();
     float four[4], ninth;
@@ -286,12 +268,12 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   const BlendVjpParams& params_;
   const VjpChunk& chunk_;
   const TileList& list_;
-  Pixels& pixels_;
-  Batch& batch_;
+  LanePixels<F, C>& pixels_;
+  VjpBatch<F, C>& batch_;
   const int lane_ = lane_id();
-  const Vec2<float> p0_ = position_of<F>(0, lane_);                   ///< of the lane's sample in subtile 0
-  const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;  ///< of subtile number `lane`
-  const int value_ = summed_value<kSumCount>(lane_);                  ///< that sum_values leaves here
+  const Vec2<float> p0_ = position_of<F>(0, lane_);  ///< in subtile 0
+  const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;
+  const int value_ = summed_value<kSumCount>(lane_);                                      ///< of sum_values()
   float* const sums_ = params_.pair_grads + (value_ == 9 ? kPairFourthChannel : value_);  ///< of row 0
 };
 
