@@ -130,9 +130,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
   constexpr int kPixels = Layout::kPixels;
   const int lane = lane_id();
   const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
+  MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
   uint32_t words[kPixels];              // of each pixel, this lane's of a batch
   const auto read_words = [&](int k) {  // of the batch that begins at k
     const int mine = k + 32 * lane;
@@ -182,7 +180,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
     }
     __syncwarp();
   }
-  blend.write(params, first, pixel);
+  blend.write(params, first);
 }
 
 template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
@@ -215,7 +213,7 @@ template <class F, int kSide> struct ListedLayouts {
 /// The splats that a warp is about to composite, in shared memory.
 template <class F, int C, int kSide> union WarpStage {
   using Layouts = ListedLayouts<F, kSide>;
-  QueuedStage<F, C, Layouts::Longest::kPlaces> queued;
+  QueuedStage<F, C> queued;
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 

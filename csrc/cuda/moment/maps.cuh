@@ -112,7 +112,7 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
     const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
     const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
     __syncthreads();  // all have read the last batch
-    stage.load(params.splats, params.channels, first, list, id);
+    stage.load(params, first, list, id);
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
@@ -121,22 +121,20 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
       const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
       stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];
-        Vec2<float> z[kCells];
-        float raw[kCells];
+        Seen seen[kCells];
         bool mask[kCells], any = false;
 #pragma unroll
         for (int i = 0; i < kCells; ++i) {
-          z[i] = corners.node(splat.terms, i, samples.place[i]);
-          raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
-          mask[i] = raw[i] >= float(kAlphaMin) && k + int(j) < last.samples[i];
+          seen[i] = corners.see(splat.terms, i, samples.position[i]);
+          mask[i] = seen[i].raw >= float(kAlphaMin) && k + int(j) < last.samples[i];
           any |= mask[i];
         }
         if (!__any_sync(kAllLanes, any)) return;
         const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
 #pragma unroll
         for (int i = 0; i < kCells; ++i)
-          map_placed_sample<F>(splat.terms, z[i], raw[i], mask[i], UnitCell<F::kSide>(), g_color,
-                               samples.transmittance[i], samples.place[i], maps[i]);
+          map_placed_sample<F>(splat.terms, seen[i].z, seen[i].raw, mask[i], UnitCell<F::kSide>(), g_color,
+                               samples.transmittance[i], samples.position[i], maps[i]);
       });
       __syncwarp();  // all have read the list
     }

@@ -48,7 +48,7 @@ template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared {
                        int k1, bool with_means) {
     for (int t = threadIdx.x; t < kBatch; t += Layout::kThreads) {
       const int32_t id = k0 + t < k1 ? list.splat(k0 + t) : -1;
-      stage.load_one(t, splats, params.channels, first, list, id);
+      stage.load_one(t, params, first, list, id);
       if (id < 0) continue;
       rows[t] = list.slot(k0 + t);
       if (with_means) mean_maps[t] = F::mean_map(load_splat<F>(splats, id).shape);

@@ -68,7 +68,7 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   /// also what MeanSums need. All threads must call it.
   __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list, int k0,
                        int32_t id, bool with_means) {
-    stage.load(params.splats, params.channels, first, list, id);
+    stage.load(params, first, list, id);
     if (id >= 0) {
       const int t = threadIdx.x;
       rows[t] = list.slot(k0 + t);

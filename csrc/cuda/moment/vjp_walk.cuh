@@ -107,13 +107,13 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, const CellCorne
   int n = 0;
   const auto composite = [&](uint32_t entry, auto is_shared) {
     const auto& terms = Stage::Lists::splat_of(stage.splats, entry).terms;
-    if constexpr (kKeeps) earlier->template put<decltype(is_shared)::value>(n, samples.place);
+    if constexpr (kKeeps) earlier->template put<decltype(is_shared)::value>(n, samples.position);
     bool any = false;
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
-      const Vec2<float> z = corners.node(terms, i, samples.place[i]);
-      any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k0 + int(entry) < last[i],
-                                     UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
+      const auto [z, raw] = corners.see(terms, i, samples.position[i]);
+      any |= replay_placed_sample<F>(terms, z, raw, k0 + int(entry) < last[i], UnitCell<F::kSide>(),
+                                     samples.transmittance[i], samples.position[i]);
     }
     if (any) shown |= 1u << n;
     ++n;
@@ -137,8 +137,7 @@ __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, i
   MovingBlendGrad<float> sums = no_moving_blend_grad<float>();
 #pragma unroll
   for (int i = 0; i < Layout::kCells; ++i) {
-    const Vec2<float> z = corners.node(splat.terms, i, positions[i]);
-    const float raw = exp2(F::log_alpha(splat.terms, z));
+    const auto [z, raw] = corners.see(splat.terms, i, positions[i]);
     const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
     add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
                              samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace, sums);
@@ -226,7 +225,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
       samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k, last);
       for (; k < k0; k += kBatch) {
         __syncthreads();
-        shared.stage.load(params.splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
+        shared.stage.load(params, first, list, shared.stage.splat_of(list, k, k0));
         __syncthreads();
         for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k, nullptr);
       }

@@ -54,14 +54,12 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
   // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
   if (is_cut && !list.of_patch) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep> blend(p, pixel.inside);
+  MovingBlend<F, C, Layout, kKeep> blend(list, params.grid);
   int32_t id = stage.splat_of(list, 0, list.count);
   for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
     const int count = min(list.count - k, kBatch);
     const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
-    stage.load(params.splats, params.channels, first, list, id);
+    stage.load(params, first, list, id);
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
@@ -81,7 +79,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
       }
     }
   }
-  blend.write(params, first, pixel);
+  blend.write(params, first);
 }
 
 }  // namespace ar::cuda
