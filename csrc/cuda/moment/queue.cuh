@@ -44,7 +44,8 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   /// The largest x of these lanes. All lanes must call it.
   __device__ static int max_of_sharers(int x) {
 #pragma unroll
-    for (int offset = 1; offset < kAhead; offset *= 2) x = max(x, __shfl_xor_sync(kAllLanes, x, offset));
+    for (int offset = 1; offset < kAhead; offset *= 2)
+      x = max(x, shuffle(x, first_sharer() + (ahead() + offset) % kAhead));
     return x;
   }
 };
@@ -219,8 +220,10 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     float left_over = transmittance;
     Vec2<float> moved = position;
     const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), left_over, moved);
-    if (first == own && b.mask) blend.sums.add(b.if_shown, splat.channels);
-    if (kKeep && first == own && b.mask) blend.last[0] = pair + 1;
+    if (first == own) {
+      if (b.mask) blend.sums.add(b.if_shown, splat.channels);
+      if (kKeep) blend.last[0] = b.mask ? pair + 1 : blend.last[0];
+    }
     if (kKeep && (hits & -hits & at_checkpoint) != 0)
       checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
     left_over = shuffle(left_over, first);
