@@ -15,9 +15,14 @@ template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, 
     const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
     launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
     launch(chain_maps_kernel<F, kSide, kSegment>, {lists * F::kSamples, kSide * kSide}, stream, p);
-    launch_segment_vjp_kernel<F, C, ClaimedLayout<F, kSide>, kSegment>(p, p.cut.max_segments, first, stream);
+    using Claimed = ClaimedLayout<F, kSide>;
+    launch_vjp<SegmentVjpShared<F, C, Claimed, kSegment>, C, Claimed, true>(
+        segment_vjp_kernel<F, C, Claimed, kSegment>, p, unsigned(segment_vjp_blocks<C, Claimed>(segments)), first,
+        stream);
   }
-  launch_moving_vjp_kernel<F, C, EvenLayout<F, kSide>>(p, unsigned(p.grid.tiles()), first, stream);
+  using Even = EvenLayout<F, kSide>;
+  launch_vjp<MovingVjpShared<F, C, Even>, C, Even, false>(moving_vjp_kernel<F, C, Even>, p, unsigned(p.grid.tiles()),
+                                                          first, stream);
 }
 
 /// The group of channels that begins with `first_of_group`; 0 where they are few.

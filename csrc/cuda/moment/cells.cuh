@@ -265,8 +265,8 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     }
     add_samples<kCells>(sums, splat.channels, [&](int i) {
       const auto [z, raw] = kVotes ? seen[i] : see(i);
-      const Blended<float> b =
-          blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), samples.transmittance[i], samples.position[i]);
+      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(),
+                                                      samples.transmittance[i], samples.position[i]);
       if (kKeep) shown[i] = b.mask ? index : shown[i];
       return b;
     });

@@ -14,26 +14,20 @@
 
 namespace ar::cuda {
 
-/// What a sample carries from a splat to the splat before it.
-struct Adjoint {
-  float behind;           ///< gradient-weighted colour of everything farther
-  Vec2<float> dL_dplace;  ///< gradient with respect to the sample's position, times kMoveGradUnit of the footprint
-};
-
 /// How an Adjoint goes through a segment: the image of zero, and what a change of each of the three numbers adds. A
-/// change of the position does not reach `behind`.
+/// change of the position does not reach `later`.
 struct SegmentMap {
   static constexpr int kNumbers = kMapNumbers;
-  Adjoint of_zero, by_behind;
+  Adjoint of_zero, by_later;
   Vec2<float> by_x, by_y;
 
   __device__ Adjoint operator()(const Adjoint& a) const {
-    const auto place = [&](float zero, float behind, float x, float y) {
-      return madd(y, a.dL_dplace.y, madd(x, a.dL_dplace.x, madd(behind, a.behind, zero)));
+    const auto position = [&](float zero, float later, float x, float y) {
+      return madd(y, a.dL_dposition.y, madd(x, a.dL_dposition.x, madd(later, a.later, zero)));
     };
-    return {madd(by_behind.behind, a.behind, of_zero.behind),
-            {place(of_zero.dL_dplace.x, by_behind.dL_dplace.x, by_x.x, by_y.x),
-             place(of_zero.dL_dplace.y, by_behind.dL_dplace.y, by_x.y, by_y.y)}};
+    return {madd(by_later.later, a.later, of_zero.later),
+            {position(of_zero.dL_dposition.x, by_later.dL_dposition.x, by_x.x, by_y.x),
+             position(of_zero.dL_dposition.y, by_later.dL_dposition.y, by_x.y, by_y.y)}};
   }
 };
 
@@ -54,13 +48,13 @@ template <class F, int kTilePixels> struct MapMemory {
     return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
   }
   __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
-    at(piece, number) = a.behind;
-    at(piece, number + 1) = a.dL_dplace.x;
-    at(piece, number + 2) = a.dL_dplace.y;
+    at(piece, number) = a.later;
+    at(piece, number + 1) = a.dL_dposition.x;
+    at(piece, number + 2) = a.dL_dposition.y;
   }
   __device__ void put(int64_t piece, const SegmentMap& m) const {
     put(piece, m.of_zero);
-    put(piece, m.by_behind, 3);
+    put(piece, m.by_later, 3);
     at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
     at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
   }
@@ -83,7 +77,7 @@ template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, k
 __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
     segment_maps_kernel(const BlendVjpParams params, int first) {
   wait_for_earlier_kernels();
-  using Samples = MovingSamples<F, Layout, true>;
+  using Lane = VjpLane<F, C, Layout, true>;
   constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   __shared__ int last_of_warps[Layout::kWarps];
@@ -91,15 +85,15 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   if (segment.tile < 0 || segment.index == 0) return;
   const TileList list = list_of(params.lists, params.grid, segment.tile);
   const StatePlaces places(params.lists, list, params.grid, segment.tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  const SampleGrad<F, C> grad(params, pixel, first);
-  const CellCorners<F, Layout> corners(p);
-  Samples samples(pixel.inside);
-  const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
-  const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
-  const auto checkpoint_at = [&](int k) { return params.checkpoints + places.of_chunk_at(k) * Samples::kCheckpoint; };
-  samples.load(checkpoint_at(begin), begin, last.samples);
+  Lane lane(params, list, first);
+  auto& samples = lane.samples;
+  const int (&last)[kCells] = lane.last.samples;
+  const int begin = segment.index * kSegment, end = begin + kSegment;
+  const int stop = min(lane.last.of_block(last_of_warps), end);
+  const auto checkpoint_at = [&](int k) {
+    return params.checkpoints + places.of_chunk_at(k) * Lane::Samples::kCheckpoint;
+  };
+  samples.load(checkpoint_at(begin), begin, last);
   AdjointMap<float> maps[kCells];
   float before[kCells];  // the transmittance
 #pragma unroll
@@ -109,7 +103,7 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   }
   int32_t id = stage.splat_of(list, begin, stop);
   for (int k = begin; k < stop; k += kBatch) {
-    const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
+    const int count = min(kBatch, min(lane.last.warp, stop) - k);  // of what this warp needs
     const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
     __syncthreads();  // all have read the last batch
     stage.load(params, first, list, id);
@@ -117,7 +111,7 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kStateChunk) {
-      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last.samples);
+      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last);
       const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
       stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];
@@ -125,12 +119,12 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
         bool mask[kCells], any = false;
 #pragma unroll
         for (int i = 0; i < kCells; ++i) {
-          seen[i] = corners.see(splat.terms, i, samples.position[i]);
-          mask[i] = seen[i].raw >= float(kAlphaMin) && k + int(j) < last.samples[i];
+          seen[i] = lane.corners.see(splat.terms, i, samples.position[i]);
+          mask[i] = seen[i].raw >= float(kAlphaMin) && k + int(j) < last[i];
           any |= mask[i];
         }
         if (!__any_sync(kAllLanes, any)) return;
-        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
+        const float g_color = lane.grad.times(splat.channels, params, lane.pixel, [&] { return list.splat(k + j); });
 #pragma unroll
         for (int i = 0; i < kCells; ++i)
           map_placed_sample<F>(splat.terms, seen[i].z, seen[i].raw, mask[i], UnitCell<F::kSide>(), g_color,
@@ -141,14 +135,14 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   }
 #pragma unroll
   for (int i = 0; i < kCells; ++i) {
-    if (last.samples[i] <= begin) continue;
+    if (last[i] <= begin) continue;
     const AdjointMap<float>& m = maps[i];
     SegmentMap map = {{divide(m.color, before[i]), m.of_color},
                       {divide(samples.transmittance[i], before[i]), m.of_behind},
                       {m.of_place.xx, m.of_place.yx},
                       {m.of_place.xy, m.of_place.yy}};
     // After the segment with a sample's last splat there is only the background.
-    if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
+    if (last[i] <= end) map.of_zero = map(lane.adjoint[i]);
     const MapMemory<F, Layout::kTilePixels> memory(params.adjoint_maps, Layout::first_sample() + i,
                                                    Layout::pixel_number());
     memory.put(segment.number, map);
