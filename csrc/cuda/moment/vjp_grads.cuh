@@ -95,18 +95,18 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   using Samples = MovingSamples<F, Layout, kTogether>;
   Pixel pixel;
   CellCorners<F, Layout> corners;
+  Samples samples;
   SamplesLast<F, Layout> last;
   SampleGrad<F, C> grad;
-  Samples samples;
   Adjoint adjoint[kCells];
 
   /// After all splats, where there is only the background. All lanes must call it.
   __device__ VjpLane(const BlendVjpParams& params, const TileList& list, int first)
       : pixel(list, params.grid, Layout::pixel()),
         corners(Layout::pixel()),
+        samples(pixel.inside),
         last(params.last, pixel),
-        grad(params, pixel, first),
-        samples(pixel.inside) {
+        grad(params, pixel, first) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
   }

@@ -23,10 +23,9 @@ template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= k
 
 /// What a block of segment_vjp_kernel has in shared memory.
 template <class F, int C, class Layout, int kSegment>
-struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>))> {
-  using Base = VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>))>;
+struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>> {
+  using Base = VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>>;
   using Sums = typename Base::Sums;
-  std::conditional_t<kSumsInside<Layout>, Sums[Layout::kGroups], char> inside;
   int segment;     ///< that the block works on
   int next_group;  ///< that a warp claims next
   int last;        ///< number of pairs up to the last that was composited into any sample
@@ -34,7 +33,7 @@ struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batc
   /// The sums of this block's groups. `outside`: BlendVjpParams::group_sums.
   __device__ Sums* sums_of_groups(float* outside) {
     if constexpr (kSumsInside<Layout>) {
-      return inside;
+      return this->inside;
     } else {
       return reinterpret_cast<Sums*>(outside) + int64_t(blockIdx.x) * Layout::kGroups;
     }

@@ -12,7 +12,7 @@ namespace ar::cuda {
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
 /// A batch of pairs that a backward block works on, in shared memory.
-template <class F, int C, class Layout, int kPairs> struct VjpBatch {
+template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatch {
   static constexpr int kBatch = kPairs, kChunks = kPairs / kStateChunk;
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
   /// What a group writes for each pair: PairGrad, C channels, MeanSums.
@@ -21,6 +21,7 @@ template <class F, int C, class Layout, int kPairs> struct VjpBatch {
   uint32_t hits[Layout::kGroups][kChunks];  ///< pairs that have sums of a group
   int32_t rows[kPairs];
   Mat2<float> mean_maps[kPairs];
+  std::conditional_t<kInside, Sums[Layout::kGroups], char> inside;  ///< of each group
 
   /// Loads splat `id` of pair k0 + t, if it is not -1, with channels from `first` on.
   __device__ void load(int t, const BlendVjpParams& params, int first, const TileList& list, int k0, int32_t id,

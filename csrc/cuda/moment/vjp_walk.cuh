@@ -144,14 +144,14 @@ template <class F, int C, class Layout, bool kTogether, class Shared, class Load
 __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int group, typename Shared::Sums& sums,
                           const TileList& list, int k0, bool with_means, VjpLane<F, C, Layout, kTogether>& lane,
                           EarlierPositions<Layout>& earlier, Load&& load) {
-  const int own_sum = sum_of_lane<C>();
-  const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
   for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
     uint32_t shown = 0;
     if (k0 + from < lane.last.warp) {
       load(from);
       shown = replay_chunk(shared.stage, from, k0, lane, &earlier);
     }
+    const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
+    const int own_sum = sum_of_lane<C>();
     for (uint32_t mask = shown; mask != 0;) {
       const int n = 31 - __clz(mask), j = int(listed[n]);
       mask ^= 1u << n;
@@ -173,9 +173,7 @@ __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int grou
 /// What a block of moving_vjp_kernel has in shared memory. Two chunks with one cell of a lane; with more cells one,
 /// which leaves more shared memory for the positions of samples.
 template <class F, int C, class Layout>
-struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk> {
-  using Base = VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk>;
-  typename Base::Sums sums[Layout::kWarps];
+struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, true> {
   int last[Layout::kWarps];  ///< of SamplesLast
 
   /// Value v of the sums of all warps for pair j.
@@ -183,7 +181,7 @@ struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kState
     float sum = 0;
 #pragma unroll
     for (int w = 0; w < Layout::kWarps; ++w) {
-      if (this->is_hit(w, j)) sum += sums[w][j][v];
+      if (this->is_hit(w, j)) sum += this->inside[w][j][v];
     }
     return sum;
   }
@@ -231,7 +229,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     const typename Lane::Samples at_batch = lane.samples;
-    batch_vjp(params, shared, warp, shared.sums[warp], list, k0, wanted.means, lane, earlier, [&](int from) {
+    batch_vjp(params, shared, warp, shared.inside[warp], list, k0, wanted.means, lane, earlier, [&](int from) {
       if (places.spacing > kStateChunk) {
         lane.samples = at_batch;
         for (int ahead = 0; ahead < from; ahead += kStateChunk) replay_chunk(shared.stage, ahead, k0, lane, nullptr);
