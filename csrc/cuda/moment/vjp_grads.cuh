@@ -96,8 +96,8 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   Pixel pixel;
   CellCorners<F, Layout> corners;
   Samples samples;
-  SamplesLast<F, Layout> last;
   SampleGrad<F, C> grad;
+  SamplesLast<F, Layout> last;
   Adjoint adjoint[kCells];
 
   /// After all splats, where there is only the background. All lanes must call it.
@@ -105,8 +105,8 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
       : pixel(list, params.grid, Layout::pixel()),
         corners(Layout::pixel()),
         samples(pixel.inside),
-        last(params.last, pixel),
-        grad(params, pixel, first) {
+        grad(params, pixel, first),
+        last(params.last, pixel) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
   }

@@ -38,32 +38,36 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   template <class Total>
   __device__ void write(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list, int count,
                         Total&& total) const {
-    const auto write_first = [&](auto used) {
-      constexpr int kUsed = decltype(used)::value;  // a constant, so that divisions by it cost little
-      for (int t = int(threadIdx.x); t < count * kUsed; t += Layout::kThreads) {
-        const int j = t / kUsed, v = t % kUsed;
-        float sum = total(j, v);
-        const int32_t row = rows[j];
-        const auto put = [&](int column) {
-          if (wanted.kMany && first > 0 && !list.of_patch)
-            sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-          put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
-        };
-        if (v >= 6 && v < kMeans) {
-          if (wanted.kMany) {
-            put_sum(params.channel_sums, kChannelGroup, list.of_patch, row, first % kChannelGroup + v - 6, sum);
-          } else {
-            put(v == 9 ? kPairFourthChannel : v);
-          }
-        } else if (wanted.shape) {
-          put(v < 6 ? v : kPairMeans + v - kMeans);
-        }
-      }
-    };
     if (wanted.means) {
-      write_first(std::integral_constant<int, kSums>());
+      write_first<kSums>(params, first, wanted, list, count, total);
     } else {
-      write_first(std::integral_constant<int, kMeans>());
+      write_first<kMeans>(params, first, wanted, list, count, total);
+    }
+  }
+
+ private:
+  /// The first kUsed sums of each pair: a constant, so that divisions by it cost little.
+  template <int kUsed, class Total>
+  __device__ void write_first(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list,
+                              int count, Total&& total) const {
+    for (int t = int(threadIdx.x); t < count * kUsed; t += Layout::kThreads) {
+      const int j = t / kUsed, v = t % kUsed;
+      float sum = total(j, v);
+      const int32_t row = rows[j];
+      const auto put = [&](int column) {
+        if (wanted.kMany && first > 0 && !list.of_patch)
+          sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+        put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
+      };
+      if (v >= 6 && v < kMeans) {
+        if (wanted.kMany) {
+          put_sum(params.channel_sums, kChannelGroup, list.of_patch, row, first % kChannelGroup + v - 6, sum);
+        } else {
+          put(v == 9 ? kPairFourthChannel : v);
+        }
+      } else if (wanted.shape) {
+        put(v < 6 ? v : kPairMeans + v - kMeans);
+      }
     }
   }
 };
