@@ -27,8 +27,8 @@ template <class F, int C> struct SampleGrad {
   float through = 0;   ///< scalar product with the background
   bool with_others;    ///< WantedSums::others
 
-  __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first)
-      : with_others(WantedSums<C>(params, first).others) {
+  __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first, bool with_others)
+      : with_others(with_others) {
 #pragma unroll
     for (int c = 0; c < C; ++c) {
       channels.v[c] = sample_gradient<F>(params, pixel, first + c);
@@ -101,11 +101,11 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   Adjoint adjoint[kCells];
 
   /// After all splats, where there is only the background. All lanes must call it.
-  __device__ VjpLane(const BlendVjpParams& params, const TileList& list, int first)
+  __device__ VjpLane(const BlendVjpParams& params, const TileList& list, int first, WantedSums<C> wanted)
       : pixel(list, params.grid, Layout::pixel()),
         corners(Layout::pixel()),
         samples(pixel.inside),
-        grad(params, pixel, first),
+        grad(params, pixel, first, wanted.others),
         last(params.last, pixel) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};

@@ -62,10 +62,10 @@ struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batc
 template <class F, int C, class Layout, int kSegment, class Shared>
 __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared, Shared& shared,
                           typename Shared::Sums& sums, const TileList& list, const StatePlaces& places,
-                          const ListSegment& segment, int k0, int k1, bool with_means) {
+                          const ListSegment& segment, int k0, int k1, WantedSums<C> wanted) {
   using Lane = VjpLane<F, C, Layout, true>;
   const int begin = segment.index * kSegment, end = begin + kSegment;
-  Lane lane(params, list, first);
+  Lane lane(params, list, first, wanted);
   const int (&last)[Layout::kCells] = lane.last.samples;
   // A sample's Adjoint after the batch is that of the background, of the next segment's map, or of the next batch,
   // which stored it in the part of this segment's own map that nobody needs any more.
@@ -79,7 +79,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     lane.adjoint[i] = k1 == end ? map_of(i).adjoint(segment.number + 1) : map_of(i).adjoint(segment.number, kCarried);
   }
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
-  batch_vjp(params, shared, Layout::group(), sums, list, k0, with_means, lane, earlier, [&](int from) {
+  batch_vjp(params, shared, Layout::group(), sums, list, k0, wanted.means, lane, earlier, [&](int from) {
     const int64_t number = places.of_chunk_at(k0 + from);
     lane.samples.load(params.checkpoints + number * Lane::Samples::kCheckpoint, k0 + from, last);
   });
@@ -131,7 +131,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
       __syncthreads();
       while (shared.claim_group())
         group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums[Layout::group()], list, places,
-                                          segment, k0, k1, wanted.means);
+                                          segment, k0, k1, wanted);
       __syncthreads();
       shared.write(params, first, wanted, list, k1 - k0, [&](int j, int v) { return shared.total(sums, j, v); });
     }

@@ -203,7 +203,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   const TileList list = list_of(params.lists, params.grid, tile);
   const StatePlaces places(params.lists, list, params.grid, tile);
   const WantedSums<C> wanted(params, first);
-  Lane lane(params, list, first);
+  Lane lane(params, list, first, wanted);
   const int stop = lane.last.of_block(shared.last);
   clear_pairs<Layout::kThreads>(params, list, stop, list.count, first);
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
