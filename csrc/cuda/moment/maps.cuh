@@ -85,7 +85,8 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   if (segment.tile < 0 || segment.index == 0) return;
   const TileList list = list_of(params.lists, params.grid, segment.tile);
   const StatePlaces places(params.lists, list, params.grid, segment.tile);
-  Lane lane(params, list, first, WantedSums<C>(params, first));
+  Lane lane(params, list);
+  lane.begin(params, first, WantedSums<C>(params, first));
   auto& samples = lane.samples;
   const int (&last)[kCells] = lane.last.samples;
   const int begin = segment.index * kSegment, end = begin + kSegment;

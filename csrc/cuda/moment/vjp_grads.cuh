@@ -24,11 +24,12 @@ template <int C> struct WantedSums {
 /// The gradient with respect to a sample of a lane's pixel.
 template <class F, int C> struct SampleGrad {
   Values<C> channels;  ///< from `first` on
-  float through = 0;   ///< scalar product with the background
+  float through;       ///< scalar product with the background
   bool with_others;    ///< WantedSums::others
 
-  __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first, bool with_others)
-      : with_others(with_others) {
+  __device__ void read(const BlendVjpParams& params, const Pixel& pixel, int first, WantedSums<C> wanted) {
+    with_others = wanted.others;
+    through = 0;
 #pragma unroll
     for (int c = 0; c < C; ++c) {
       channels.v[c] = sample_gradient<F>(params, pixel, first + c);
@@ -96,17 +97,19 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   Pixel pixel;
   CellCorners<F, Layout> corners;
   Samples samples;
-  SampleGrad<F, C> grad;
   SamplesLast<F, Layout> last;
+  SampleGrad<F, C> grad;
   Adjoint adjoint[kCells];
 
-  /// After all splats, where there is only the background. All lanes must call it.
-  __device__ VjpLane(const BlendVjpParams& params, const TileList& list, int first, WantedSums<C> wanted)
+  /// All lanes must call it.
+  __device__ VjpLane(const BlendVjpParams& params, const TileList& list)
       : pixel(list, params.grid, Layout::pixel()),
         corners(Layout::pixel()),
         samples(pixel.inside),
-        grad(params, pixel, first, wanted.others),
-        last(params.last, pixel) {
+        last(params.last, pixel) {}
+  /// Reads the gradient of the image. Sets `adjoint` to what it is after all splats, where there is only the background.
+  __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
+    grad.read(params, pixel, first, wanted);
 #pragma unroll
     for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
   }

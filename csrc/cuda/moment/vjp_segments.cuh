@@ -65,7 +65,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
                           const ListSegment& segment, int k0, int k1, WantedSums<C> wanted) {
   using Lane = VjpLane<F, C, Layout, true>;
   const int begin = segment.index * kSegment, end = begin + kSegment;
-  Lane lane(params, list, first, wanted);
+  Lane lane(params, list);
+  lane.begin(params, first, wanted);
   const int (&last)[Layout::kCells] = lane.last.samples;
   // A sample's Adjoint after the batch is that of the background, of the next segment's map, or of the next batch,
   // which stored it in the part of this segment's own map that nobody needs any more.

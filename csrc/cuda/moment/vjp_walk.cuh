@@ -203,9 +203,10 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   const TileList list = list_of(params.lists, params.grid, tile);
   const StatePlaces places(params.lists, list, params.grid, tile);
   const WantedSums<C> wanted(params, first);
-  Lane lane(params, list, first, wanted);
+  Lane lane(params, list);
   const int stop = lane.last.of_block(shared.last);
   clear_pairs<Layout::kThreads>(params, list, stop, list.count, first);
+  lane.begin(params, first, wanted);
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
   int k0 = (stop - 1) / kBatch * kBatch;
   int32_t id = shared.stage.splat_of(list, k0, stop);
