@@ -61,10 +61,11 @@ struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batc
 /// Takes a group of a segment's samples back through the staged batch of pairs [k0, k1).
 template <class F, int C, class Layout, int kSegment, class Shared>
 __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared, Shared& shared,
-                          typename Shared::Sums& sums, const TileList& list, const StatePlaces& places,
+                          typename Shared::Sums* sums, const TileList& list, const StatePlaces& places,
                           const ListSegment& segment, int k0, int k1, WantedSums<C> wanted) {
   using Lane = VjpLane<F, C, Layout, true>;
   const int begin = segment.index * kSegment, end = begin + kSegment;
+  const int group = Layout::group();
   Lane lane(params, list);
   lane.begin(params, first, wanted);
   const int (&last)[Layout::kCells] = lane.last.samples;
@@ -80,7 +81,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     lane.adjoint[i] = k1 == end ? map_of(i).adjoint(segment.number + 1) : map_of(i).adjoint(segment.number, kCarried);
   }
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
-  batch_vjp(params, shared, Layout::group(), sums, list, k0, wanted.means, lane, earlier, [&](int from) {
+  batch_vjp(params, shared, group, sums[group], list, k0, wanted.means, lane, earlier, [&](int from) {
     const int64_t number = places.of_chunk_at(k0 + from);
     lane.samples.load(params.checkpoints + number * Lane::Samples::kCheckpoint, k0 + from, last);
   });
@@ -131,7 +132,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
       if (threadIdx.x == 0) shared.next_group = 0;
       __syncthreads();
       while (shared.claim_group())
-        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums[Layout::group()], list, places,
+        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums, list, places,
                                           segment, k0, k1, wanted);
       __syncthreads();
       shared.write(params, first, wanted, list, k1 - k0, [&](int j, int v) { return shared.total(sums, j, v); });
