@@ -17,11 +17,6 @@ inline constexpr int kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp reads at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// A warp has kPixelsOfWarp pixels, and each lane a sample. With more pixels a warp takes fewer steps for each, and
-/// more pixels wait for the longest list.
-template <class F, int kSide, int kPixelsOfWarp, int kWarps>
-struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarps> {};
-
 /// Bit x: the span holds pixel x0 + x of a row of kSide pixels. The differences are exact wherever they decide.
 template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float x0) {
   const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kSide))));
@@ -125,11 +120,11 @@ template <class F, int C, int kMostPixels> struct ListedStage {
 /// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels
 /// from `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
-__device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+__device__ void blend_listed(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
   const int lane = lane_id();
-  const StatePlaces places(params.lists, list, params.grid, tile);
+  const StatePlaces places(params.lists, list, params.grid, cut.tile);
   MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
   uint32_t words[kPixels];              // of each pixel, this lane's of a batch
   const auto read_words = [&](int k) {  // of the batch that begins at k
@@ -137,7 +132,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
       const uint32_t* from =
-          params.reach_words + pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number(i));
+          params.reach_words + pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number(i));
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
@@ -193,8 +188,8 @@ template <class F, int kSide> struct ListedLayouts {
   /// Other lists: with one sample they have queues too, with four they are walked, with more there are none.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
-  using Long = SampleLayout<F, kSide, 2, kWarps>;  ///< from kLongList pairs on
-  using Short = SampleLayout<F, kSide, kWalked ? 8 : 2, kWarps>;
+  using Long = CellLayout<1, 16, kSide, kWarps>;  ///< from kLongList pairs on
+  using Short = CellLayout<1, kWalked ? 4 : 16, kSide, kWarps>;
   /// Blocks of a list. The first blocks of a short list have its pixels.
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
@@ -224,7 +219,6 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
   using Layouts = ListedLayouts<F, kSide>;
-  using Short = typename Layouts::Short;
   __shared__ WarpStage<F, C, kSide> stages[Layouts::kWarps];
   WarpStage<F, C, kSide>& stage = stages[threadIdx.x / 32];
   const PlanCounts& counts = params.plan.state->counts;
@@ -232,24 +226,24 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
   const int blocks = of_longest + (counts.cut_lists - longest) * Layouts::kOfOthers;
   for (int block = blockIdx.x; block < blocks; block += gridDim.x) {
     const bool is_longest = block < of_longest;
-    const int place = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
-    const CutList cut = params.plan.cut_lists[place];
+    const int index = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
+    const CutList cut = params.plan.cut_lists[index];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
+    const auto queued = [&](auto layout) {
+      blend_queued<F, C, decltype(layout), kKeep, kSegment>(params, first, cut, list, stage.queued);
+    };
+    const auto walked = [&](auto layout) {
+      blend_listed<F, C, decltype(layout), kKeep, kSegment>(params, first, cut, list, stage.listed);
+    };
     if (is_longest) {
-      using Longest = typename Layouts::Longest;
-      blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
-      continue;
-    }
-    if constexpr (Layouts::kAhead) {
-      blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
-                                                                   stage.queued);
-    }
-    if constexpr (Layouts::kWalked) {
+      queued(typename Layouts::Longest());
+    } else if constexpr (Layouts::kAhead) {
+      queued(typename Layouts::Ahead());
+    } else if constexpr (Layouts::kWalked) {
       if (list.count >= kLongList) {
-        blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
-                                                                    stage.listed);
-      } else if (block % Layouts::kOfOthers < Short::kBlocks) {
-        blend_listed<F, C, Short, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.listed);
+        walked(typename Layouts::Long());
+      } else if (block % Layouts::kOfOthers < Layouts::Short::kBlocks) {
+        walked(typename Layouts::Short());
       }
     }
   }

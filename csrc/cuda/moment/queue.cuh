@@ -251,14 +251,14 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
 /// Blends the pixels of a warp, as Layout shares them out, by queues; C channels from `first` on. `first_segment`: the
 /// number of the list's first segment. `kKeep`, `kSegment`: for a backward pass with segments of so many pairs.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
-__device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+__device__ void blend_queued(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kLanes = Layout::kLanes;
-  const StatePlaces places(params.lists, list, params.grid, tile);
+  const StatePlaces places(params.lists, list, params.grid, cut.tile);
   MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
   CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
-  const int64_t words = pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number());
+  const int64_t words = pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
                 blend.pixel.inside ? list.count : 0);
   // While splats are composited, the next ones are read, and the numbers of the ones after those.

@@ -107,7 +107,8 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
         corners(Layout::pixel()),
         samples(pixel.inside),
         last(params.last, pixel) {}
-  /// Reads the gradient of the image. Sets `adjoint` to what it is after all splats, where there is only the background.
+  /// Reads the gradient of the image. Sets `adjoint` to what it is after all splats, where there is only the
+  /// background.
   __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
     grad.read(params, pixel, first, wanted);
 #pragma unroll

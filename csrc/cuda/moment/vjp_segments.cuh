@@ -23,7 +23,8 @@ template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= k
 
 /// What a block of segment_vjp_kernel has in shared memory.
 template <class F, int C, class Layout, int kSegment>
-struct SegmentVjpShared : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>> {
+struct SegmentVjpShared
+    : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>> {
   using Base = VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>>;
   using Sums = typename Base::Sums;
   int segment;     ///< that the block works on
@@ -132,8 +133,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
       if (threadIdx.x == 0) shared.next_group = 0;
       __syncthreads();
       while (shared.claim_group())
-        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums, list, places,
-                                          segment, k0, k1, wanted);
+        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums, list, places, segment, k0, k1,
+                                          wanted);
       __syncthreads();
       shared.write(params, first, wanted, list, k1 - k0, [&](int j, int v) { return shared.total(sums, j, v); });
     }

@@ -28,64 +28,49 @@ inline constexpr int kMovingVjpBlocks =
 /// The positions of a lane's samples before each splat of a chunk that reaches its warp. Positions before the first few
 /// splats are in shared memory, as far as there is room, the others in local memory, of which the caches hold only a
 /// part.
-template <class Layout> class EarlierPositions {
+template <class Layout> struct EarlierPositions {
   static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
   struct alignas(kTogether * sizeof(Vec2<float>)) Together {
     Vec2<float> of[kTogether];
   };
   using OfWarp = Together[kCells / kTogether][32];
-
- public:
   using Positions = Vec2<float>[kCells];
   /// Bytes of shared memory that a block needs for each splat.
   static constexpr size_t kBytes = Layout::kWarps * sizeof(OfWarp);
   /// The number of splats whose positions are in shared memory is a multiple of this number.
   static constexpr int kUnit = kListAhead<Layout>;
 
+  int begin, in_shared;
+  Together local[kStateChunk][kCells / kTogether];
+
   /// The shared memory from byte `begin` on is for the positions before so many splats.
   __device__ EarlierPositions(size_t begin, int splats)
-      : begin_(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared_(splats) {}
-
-  __device__ int in_shared() const { return in_shared_; }
-
-  /// Before splat n of the list; kShared: n < in_shared().
+      : begin(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared(splats) {}
+  /// Not a member: the compiler has to see that it points to shared memory.
+  __device__ OfWarp* shared() const {
+    return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin);
+  }
+  /// Before splat n of the list; kShared: n < in_shared.
   template <bool kShared> __device__ void put(int n, const Positions& positions) {
 #pragma unroll
     for (int i = 0; i < kCells; i += kTogether) {
       Together together;
 #pragma unroll
       for (int j = 0; j < kTogether; ++j) together.of[j] = positions[i + j];
-      if constexpr (kShared) {
-        shared()[n][i / kTogether][lane_id()] = together;
-      } else {
-        local_[n][i / kTogether] = together;
-      }
+      (kShared ? shared()[n][i / kTogether][lane_id()] : local[n][i / kTogether]) = together;
     }
   }
   __device__ void get(int n, Positions& positions) const {
-    if (n < in_shared_) {
-      read([&](int i) { return shared()[n][i][lane_id()]; }, positions);
-    } else {
-      read([&](int i) { return local_[n][i]; }, positions);
-    }
-  }
-
- private:
-  /// Not a member: the compiler has to see that it points to shared memory.
-  __device__ OfWarp* shared() const {
-    return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin_);
-  }
-  template <class From> __device__ static void read(From&& from, Positions& positions) {
+    const bool is_shared = n < in_shared;
 #pragma unroll
     for (int i = 0; i < kCells; i += kTogether) {
-      const Together together = from(i / kTogether);
+      Together together;
+      if (is_shared) together = shared()[n][i / kTogether][lane_id()];
+      if (!is_shared) together = local[n][i / kTogether];
 #pragma unroll
       for (int j = 0; j < kTogether; ++j) positions[i + j] = together.of[j];
     }
   }
-
-  int begin_, in_shared_;
-  Together local_[kStateChunk][kCells / kTogether];
 };
 
 /// Composites the staged splats in [from, from + 32) that reach the warp, and lists them; `k0`: the pair that is staged
@@ -114,7 +99,7 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, L
     ++n;
   };
   int in_shared = listed;
-  if constexpr (kKeeps) in_shared = min(in_shared, earlier->in_shared());
+  if constexpr (kKeeps) in_shared = min(in_shared, earlier->in_shared);
   stage.lists.for_each(0, in_shared, [&](uint32_t entry) { composite(entry, std::true_type()); });
   if constexpr (kKeeps)
     stage.lists.for_each(in_shared, listed, [&](uint32_t entry) { composite(entry, std::false_type()); });
