@@ -229,21 +229,15 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
     const int index = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
     const CutList cut = params.plan.cut_lists[index];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
-    const auto queued = [&](auto layout) {
-      blend_queued<F, C, decltype(layout), kKeep, kSegment>(params, first, cut, list, stage.queued);
-    };
-    const auto walked = [&](auto layout) {
-      blend_listed<F, C, decltype(layout), kKeep, kSegment>(params, first, cut, list, stage.listed);
-    };
     if (is_longest) {
-      queued(typename Layouts::Longest());
+      blend_queued<F, C, typename Layouts::Longest, kKeep, kSegment>(params, first, cut, list, stage.queued);
     } else if constexpr (Layouts::kAhead) {
-      queued(typename Layouts::Ahead());
+      blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut, list, stage.queued);
     } else if constexpr (Layouts::kWalked) {
       if (list.count >= kLongList) {
-        walked(typename Layouts::Long());
+        blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut, list, stage.listed);
       } else if (block % Layouts::kOfOthers < Layouts::Short::kBlocks) {
-        walked(typename Layouts::Short());
+        blend_listed<F, C, typename Layouts::Short, kKeep, kSegment>(params, first, cut, list, stage.listed);
       }
     }
   }
