@@ -22,12 +22,10 @@ struct SegmentMap {
   Vec2<float> by_x, by_y;
 
   __device__ Adjoint operator()(const Adjoint& a) const {
-    const auto position = [&](float zero, float later, float x, float y) {
-      return madd(y, a.dL_dposition.y, madd(x, a.dL_dposition.x, madd(later, a.later, zero)));
-    };
+    const Vec2<float>&zero = of_zero.dL_dposition, &later = by_later.dL_dposition, &at = a.dL_dposition;
     return {madd(by_later.later, a.later, of_zero.later),
-            {position(of_zero.dL_dposition.x, by_later.dL_dposition.x, by_x.x, by_y.x),
-             position(of_zero.dL_dposition.y, by_later.dL_dposition.y, by_x.y, by_y.y)}};
+            {madd(by_y.x, at.y, madd(by_x.x, at.x, madd(later.x, a.later, zero.x))),
+             madd(by_y.y, at.y, madd(by_x.y, at.x, madd(later.y, a.later, zero.y)))}};
   }
 };
 
@@ -38,25 +36,18 @@ template <class F, int kTilePixels> struct MapMemory {
   float* first;  ///< of the sample
 
   __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
-  __device__ float& at(int64_t piece, int number) const {
-    return first[(piece * SegmentMap::kNumbers + number) * kPlane];
+  /// The numbers of an Adjoint or a SegmentMap from number `from` of the map of a segment on.
+  template <class Numbers> __device__ Numbers get(int64_t segment, int from = 0) const {
+    float numbers[sizeof(Numbers) / sizeof(float)];
+    for (float& number : numbers) number = first[(segment * SegmentMap::kNumbers + from++) * kPlane];
+    Numbers all;
+    memcpy(&all, numbers, sizeof all);
+    return all;
   }
-  __device__ Adjoint adjoint(int64_t piece, int number = 0) const {
-    return {at(piece, number), {at(piece, number + 1), at(piece, number + 2)}};
-  }
-  __device__ SegmentMap map(int64_t piece) const {
-    return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
-  }
-  __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
-    at(piece, number) = a.later;
-    at(piece, number + 1) = a.dL_dposition.x;
-    at(piece, number + 2) = a.dL_dposition.y;
-  }
-  __device__ void put(int64_t piece, const SegmentMap& m) const {
-    put(piece, m.of_zero);
-    put(piece, m.by_later, 3);
-    at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
-    at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
+  template <class Numbers> __device__ void put(int64_t segment, const Numbers& all, int from = 0) const {
+    float numbers[sizeof(Numbers) / sizeof(float)];
+    memcpy(numbers, &all, sizeof all);
+    for (float number : numbers) first[(segment * SegmentMap::kNumbers + from++) * kPlane] = number;
   }
 };
 
@@ -168,11 +159,11 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   if (segment <= 1) return;
   const int64_t first = cut.first;
   const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
-  Adjoint adjoint = memory.adjoint(first + segment);
+  Adjoint adjoint = memory.template get<Adjoint>(first + segment);
   for (; segment > 1; segment -= kMapsAhead) {
     SegmentMap maps[kMapsAhead];
 #pragma unroll
-    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
 #pragma unroll
     for (int i = 0; i < kMapsAhead; ++i) {
       if (segment - 1 - i < 1) return;

@@ -127,9 +127,6 @@ template <class Layout> struct PairQueues {
     }
     __syncwarp();
   }
-  /// How many there are for the lanes of the pixel, one each, and this lane's.
-  __device__ int ready() const { return min(int(end - begin), Layout::kLanes); }
-  __device__ int pair() const { return pairs[(begin + uint32_t(lane)) % kRoom]; }
   /// Drops the pairs of the pixel, and all that follow.
   __device__ void close() {
     count = 0;
@@ -169,9 +166,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
     take_next(queues);
   }
   template <class Queues> __device__ void take_next(Queues& queues) {
-    next_n = queues.ready();
+    next_n = min(int(queues.end - queues.begin), Layout::kLanes);  // one for each lane of the pixel
     if (queues.lane < next_n) {
-      next_pair = queues.pair();
+      next_pair = queues.pairs[(queues.begin + uint32_t(queues.lane)) % Queues::kRoom];
       next_id = list.splat(next_pair);
     }
     queues.begin += uint32_t(next_n);

@@ -31,14 +31,6 @@ struct SegmentVjpShared
   int next_group;  ///< that a warp claims next
   int last;        ///< number of pairs up to the last that was composited into any sample
 
-  /// The sums of this block's groups. `outside`: BlendVjpParams::group_sums.
-  __device__ Sums* sums_of_groups(float* outside) {
-    if constexpr (kSumsInside<Layout>) {
-      return this->inside;
-    } else {
-      return reinterpret_cast<Sums*>(outside) + int64_t(blockIdx.x) * Layout::kGroups;
-    }
-  }
   /// Claims a group for the warp; false if none is left. All lanes must call it.
   __device__ bool claim_group() {
     int group = 0;
@@ -79,7 +71,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
 #pragma unroll
   for (int i = 0; i < Layout::kCells; ++i) {
     if (last[i] <= k1) continue;
-    lane.adjoint[i] = k1 == end ? map_of(i).adjoint(segment.number + 1) : map_of(i).adjoint(segment.number, kCarried);
+    lane.adjoint[i] = k1 == end ? map_of(i).template get<Adjoint>(segment.number + 1)
+                                : map_of(i).template get<Adjoint>(segment.number, kCarried);
   }
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
   batch_vjp(params, shared, group, sums[group], list, k0, wanted.means, lane, earlier, [&](int from) {
@@ -101,7 +94,9 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   using Shared = SegmentVjpShared<F, C, Layout, kSegment>;
   static_assert(kSegment % Shared::kBatch == 0);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  auto* const sums = shared.sums_of_groups(params.group_sums);
+  auto* const outside =
+      reinterpret_cast<typename Shared::Sums*>(params.group_sums) + int64_t(blockIdx.x) * Layout::kGroups;
+  auto* const sums = kSumsInside<Layout> ? reinterpret_cast<typename Shared::Sums*>(&shared.inside) : outside;
   const WantedSums<C> wanted(params, first);
   const int warp = threadIdx.x / 32, lane = lane_id();
   while (true) {
