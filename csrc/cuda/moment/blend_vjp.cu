@@ -34,33 +34,34 @@ template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int
     launch_group<F, kMovingChannels, kSide>(p, first, stream);
 }
 
+/// Calls f with the footprint and, as a constant, the side of the tiles.
+template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
+  visit_pixels(footprint, [&](auto chosen) {
+    using F = decltype(chosen);
+    if constexpr (F::kMoves) with_tile_side<F>(grid, [&](auto side) { f(chosen, side); });
+  });
+}
+
 }  // namespace
 
 int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid) {
   int64_t numbers = 0;
-  visit_pixels(footprint, [&](auto f) {
+  if (cut.max_segments == 0) return 0;
+  visit_tiles(footprint, grid, [&](auto f, auto side) {
     using F = decltype(f);
-    if constexpr (F::kMoves) {
-      if (cut.max_segments == 0) return;
-      with_tile_side<F>(grid, [&](auto side) {
-        constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
-        using Layout = ClaimedLayout<F, kSide>;
-        numbers = channels == 3              ? group_sums_of<F, 3, Layout, kSegment>(cut.max_segments)
-                  : channels <= kFewChannels ? group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments)
-                                             : group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
-      });
-    }
+    constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
+    using Layout = ClaimedLayout<F, kSide>;
+    const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
+    numbers = channels > kFewChannels
+                  ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)
+                  : std::max(of_colors, group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments));
   });
   return numbers;
 }
 
 void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (F::kMoves) {
-      with_tile_side<F>(p.grid, [&](auto side) { launch_blend_vjp<F, decltype(side)::value>(p, first, stream); });
-    }
-  });
+  visit_tiles(footprint, p.grid,
+              [&](auto f, auto side) { launch_blend_vjp<decltype(f), decltype(side)::value>(p, first, stream); });
 }
 
 }  // namespace ar::cuda

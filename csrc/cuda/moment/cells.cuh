@@ -94,8 +94,10 @@ struct StatePlaces {
     first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
-  /// The number of the checkpoint before chunk k / kStateChunk, where every chunk but the first has one.
-  __device__ int64_t of_chunk_at(int k) const { return first + k / kStateChunk - 1; }
+  /// The checkpoint before pair k, where each chunk of kStateChunk pairs but the first has one.
+  template <class Samples> __device__ float* at(float* checkpoints, int k) const {
+    return checkpoints + (first + k / kStateChunk - 1) * Samples::kCheckpoint;
+  }
 };
 
 /// The terms of a splat for the cells of a tile: lengths are in edges of cells.
@@ -225,11 +227,6 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
       if (bits) splats[t] = {cell_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
     }
     reach[t] = bits;
-  }
-
-  /// The splats in [k, k + 32) that reach this warp's pixels, in the order of take_first. All lanes must call it.
-  __device__ uint32_t reached(int k) const {
-    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
 

@@ -78,14 +78,12 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   const StatePlaces places(params.lists, list, params.grid, segment.tile);
   Lane lane(params, list);
   lane.begin(params, first, WantedSums<C>(params, first));
-  auto& samples = lane.samples;
+  using Samples = typename Lane::Samples;
+  Samples& samples = lane.samples;
   const int (&last)[kCells] = lane.last.samples;
   const int begin = segment.index * kSegment, end = begin + kSegment;
   const int stop = min(lane.last.of_block(last_of_warps), end);
-  const auto checkpoint_at = [&](int k) {
-    return params.checkpoints + places.of_chunk_at(k) * Lane::Samples::kCheckpoint;
-  };
-  samples.load(checkpoint_at(begin), begin, last);
+  samples.load(places.at<Samples>(params.checkpoints, begin), begin, last);
   AdjointMap<float> maps[kCells];
   float before[kCells];  // the transmittance
 #pragma unroll
@@ -103,7 +101,8 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kStateChunk) {
-      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last);
+      if (first == 0 && k + from > begin)
+        samples.store(places.at<Samples>(params.checkpoints, k + from), k + from, last);
       const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
       stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];

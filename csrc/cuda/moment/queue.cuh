@@ -127,11 +127,6 @@ template <class Layout> struct PairQueues {
     }
     __syncwarp();
   }
-  /// Drops the pairs of the pixel, and all that follow.
-  __device__ void close() {
-    count = 0;
-    begin = end;
-  }
 };
 
 /// The splats that each pixel of a warp is about to composite, and the queues that they come from, in shared memory.
@@ -273,7 +268,7 @@ __device__ void blend_queued(const BlendParams& params, int first, const CutList
     __syncwarp();
     blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, checkpoints);
     if (!(__ballot_sync(kAllLanes, blend.samples.open()) & lanes_of_pixel)) {
-      queues.close();
+      queues.count = 0, queues.begin = queues.end;
       next.n = next.next_n = 0;
     }
     __syncwarp();  // all have read the splats

@@ -76,8 +76,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   }
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
   batch_vjp(params, shared, group, sums[group], list, k0, wanted.means, lane, earlier, [&](int from) {
-    const int64_t number = places.of_chunk_at(k0 + from);
-    lane.samples.load(params.checkpoints + number * Lane::Samples::kCheckpoint, k0 + from, last);
+    lane.samples.load(places.at<typename Lane::Samples>(params.checkpoints, k0 + from), k0 + from, last);
   });
   if (k0 == begin) return;
 #pragma unroll

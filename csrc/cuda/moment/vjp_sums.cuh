@@ -3,8 +3,6 @@
 // write_pairs adds up the warps and writes rows of pair_grads and channel_sums.
 #pragma once
 
-#include <algorithm>
-
 #include "cuda/moment/vjp_grads.cuh"
 
 namespace ar::cuda {
@@ -87,11 +85,8 @@ template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewCh
 /// call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
-  const float of_shape[6] = {shape.offset.x, shape.offset.y, shape.shape.xx,
-                             shape.shape.xy, shape.shape.yy, grad.weighted};
-  float values[C <= kFewChannels ? 6 + C : 8] = {};
-#pragma unroll
-  for (int v = 0; v < 6; ++v) values[v] = of_shape[v];
+  float values[C <= kFewChannels ? 6 + C : 8] = {shape.offset.x, shape.offset.y, shape.shape.xx,
+                                                 shape.shape.xy, shape.shape.yy, grad.weighted};
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];

@@ -180,6 +180,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout>;
   using Lane = VjpLane<F, C, Layout>;
+  using Samples = typename Lane::Samples;
   constexpr int kBatch = Shared::kBatch;
   static_assert(Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
@@ -199,7 +200,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     if (places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
       const int checkpoint = k0 / places.spacing;
       int k = checkpoint * places.spacing;
-      lane.samples.load(params.checkpoints + (places.first + checkpoint - 1) * Lane::Samples::kCheckpoint, k,
+      lane.samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k,
                         lane.last.samples);
       for (; k < k0; k += kBatch) {
         __syncthreads();
@@ -214,14 +215,13 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
-    const typename Lane::Samples at_batch = lane.samples;
+    const Samples at_batch = lane.samples;
     batch_vjp(params, shared, warp, shared.inside[warp], list, k0, wanted.means, lane, earlier, [&](int from) {
       if (places.spacing > kStateChunk) {
         lane.samples = at_batch;
         for (int ahead = 0; ahead < from; ahead += kStateChunk) replay_chunk(shared.stage, ahead, k0, lane, nullptr);
       } else {
-        const int64_t number = places.of_chunk_at(k0 + from);
-        lane.samples.load(params.checkpoints + number * Lane::Samples::kCheckpoint, k0 + from, lane.last.samples);
+        lane.samples.load(places.at<Samples>(params.checkpoints, k0 + from), k0 + from, lane.last.samples);
       }
     });
     __syncthreads();

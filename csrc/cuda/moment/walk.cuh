@@ -65,7 +65,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
           if (shown[i] >= 0) blend.last[i] = k + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
         __syncwarp();  // all have read the list
       } else {
-        for (uint32_t left = stage.reached(from); left != 0;) {
+        const bool reaches = stage.reach[from + 31 - lane_id()] >> (threadIdx.x / 32) & 1;
+        for (uint32_t left = __ballot_sync(kAllLanes, reaches); left != 0;) {
           const int j = from + take_first(left);
           TileSplatRef<F, C> splat = stage.splats[j];
           blend.add(splat, k + j + 1, blend.last);
