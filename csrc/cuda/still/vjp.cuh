@@ -11,25 +11,6 @@
 
 namespace ar::cuda {
 
-/// Walks chunk_order[item].
-template <class F, int C, bool kMeans>
-__device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, SharedPixels<F, C>& shared,
-                                                VjpBatch<F, C>& batch) {
-  LanePixels<F, C> pixels(shared);
-  const VjpChunk chunk(params, params.chunk_order[item]);
-  const int tile_last = find_last<F>(params, chunk, batch);
-  if (!chunk.list.of_patch) {  // pairs that no pixel has composited
-    for (int k = max(chunk.begin, min(tile_last, chunk.end)) + lane_id(); k < chunk.end; k += 32)
-      clear_pair(params, chunk.list.slot(k));
-  }
-  if (chunk.begin >= tile_last) return;
-  const auto* checkpoints =
-      reinterpret_cast<const Checkpoint<C>*>(params.checkpoints + int64_t(chunk.plane) * kTilePixels);
-  ChunkWalk<F, C, kMeans> walk(params, chunk, pixels, batch);
-  start_pixels(params, chunk, checkpoints, tile_last <= chunk.end, pixels);
-  walk.run(tile_last);
-}
-
 template <class F, int C> struct VjpShared {
   SharedPixels<F, C> pixels[vjp_warps(F::kSamples)];
   VjpBatch<F, C> batches[vjp_warps(F::kSamples)];
@@ -49,7 +30,20 @@ __global__ void __launch_bounds__(32 * vjp_warps(F::kSamples),
     if (lane_id() == 0) taken = atomicAdd(params.chunks_taken, 1);
     const int item = shuffle(taken, 0);
     if (item >= chunks) return;
-    blend_chunk_vjp<F, C, kMeans>(params, item, shared.pixels[warp], shared.batches[warp]);
+    LanePixels<F, C> pixels(shared.pixels[warp]);
+    VjpBatch<F, C>& batch = shared.batches[warp];
+    const VjpChunk chunk(params, params.chunk_order[item]);
+    const int tile_last = find_last<F>(params, chunk, batch);
+    if (!chunk.list.of_patch) {  // pairs that no pixel has composited
+      for (int k = max(chunk.begin, min(tile_last, chunk.end)) + lane_id(); k < chunk.end; k += 32)
+        clear_pair(params, chunk.list.slot(k));
+    }
+    if (chunk.begin >= tile_last) continue;
+    const auto* checkpoints =
+        reinterpret_cast<const Checkpoint<C>*>(params.checkpoints + int64_t(chunk.plane) * kTilePixels);
+    ChunkWalk<F, C, kMeans> walk(params, chunk, pixels, batch);
+    start_pixels(params, chunk, checkpoints, tile_last <= chunk.end, pixels);
+    walk.run(tile_last);
   }
 }
 

@@ -146,11 +146,10 @@ template <class F, int C, bool kMeans> class ChunkWalk {
 
  private:
   static constexpr int S = F::kSamples, kSumCount = 6 + C;
-  static constexpr bool kPairSums = kHoldsSamples<C>;
 
   /// Farthest first. k0: first pair of the batch. `mean_map`: of the lane's own pair.
   template <MeanSums kKind> __device__ void walk_listed(int k0, int listed, const Mat2<float>& mean_map) {
-    if constexpr (kPairSums) {
+    if constexpr (kHoldsSamples<C>) {
       for (int n = 0; n < listed; n += PairSums::kPairs) {
         const int count = min(listed - n, PairSums::kPairs);
         const auto* splat = batch_.splats + n;
@@ -234,7 +233,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
                                shape.shape.xy, shape.shape.yy, weighted};
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-    if constexpr (kPairSums) {
+    if constexpr (kHoldsSamples<C>) {
       to.put(values);
     } else {
       const float sum = sum_values(values);
