@@ -40,9 +40,11 @@ int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, Tile
       with_tile_side<F>(grid, [&](auto side) {
         constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
         using Layout = ClaimedLayout<F, kSide>;
-        numbers = channels == 3              ? group_sums_of<F, 3, Layout, kSegment>(cut.max_segments)
-                  : channels <= kFewChannels ? group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments)
-                                             : group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
+        // Three channels may be rows, whose kernels have kFewChannels.
+        const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
+        numbers = channels > kFewChannels
+                      ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)
+                      : std::max(of_colors, group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments));
       });
     }
   });
