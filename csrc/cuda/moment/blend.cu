@@ -8,18 +8,14 @@ namespace {
 
 /// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are cut is launched first,
 /// because the longest of them may outlast everything else, and the kernel for the other lists begins beside it.
-template <class F, int C, int kSide, bool kKeep>
-void launch_kernels(const BlendParams& p, int first, cudaStream_t stream) {
-  using Layout = EvenLayout<F, kSide>;
-  const ListCut& cut = p.cut;
-  const unsigned blocks = cut.max_lists > 0 ? ListedLayouts<F, kSide>::blocks(cut, p.grid, multiprocessors()) : 0;
-  if (blocks > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {blocks, 32 * kListedWarps<F>}, stream, p, first);
-  const LaunchShape tiles = {unsigned(p.grid.tiles() + 1), Layout::kThreads};
-  launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, blocks > 0);
-}
 template <class F, int C, int kSide> void launch_group(const BlendParams& p, int first, cudaStream_t stream) {
-  if (p.transmittance && first == 0) return launch_kernels<F, C, kSide, true>(p, first, stream);
-  launch_kernels<F, C, kSide, false>(p, first, stream);
+  using Layout = EvenLayout<F, kSide>;
+  const bool keeps = p.transmittance && first == 0;
+  const auto listed = keeps ? listed_blend_kernel<F, C, kSide, true> : listed_blend_kernel<F, C, kSide, false>;
+  const auto others = keeps ? moving_blend_kernel<F, C, Layout, true> : moving_blend_kernel<F, C, Layout, false>;
+  const unsigned blocks = p.cut.max_lists > 0 ? ListedLayouts<F, kSide>::blocks(p.cut, p.grid, multiprocessors()) : 0;
+  if (blocks > 0) launch(listed, {blocks, 32 * kListedWarps<F>}, stream, p, first);
+  launch(others, {unsigned(p.grid.tiles() + 1), Layout::kThreads}, stream, p, first, blocks > 0);
 }
 
 template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream_t stream) {

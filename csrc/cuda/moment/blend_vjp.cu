@@ -15,9 +15,14 @@ template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, 
     const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
     launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
     launch(chain_maps_kernel<F, kSide, kSegment>, {lists * F::kSamples, kSide * kSide}, stream, p);
-    launch_segment_vjp_kernel<F, C, ClaimedLayout<F, kSide>, kSegment>(p, p.cut.max_segments, first, stream);
+    using Claimed = ClaimedLayout<F, kSide>;
+    launch_vjp<SegmentVjpShared<F, C, Claimed, kSegment>, C, Claimed, true>(
+        segment_vjp_kernel<F, C, Claimed, kSegment>, p, unsigned(segment_vjp_blocks<C, Claimed>(segments)), first,
+        stream);
   }
-  launch_moving_vjp_kernel<F, C, EvenLayout<F, kSide>>(p, unsigned(p.grid.tiles()), first, stream);
+  using Even = EvenLayout<F, kSide>;
+  launch_vjp<MovingVjpShared<F, C, Even>, C, Even, false>(moving_vjp_kernel<F, C, Even>, p, unsigned(p.grid.tiles()),
+                                                          first, stream);
 }
 
 /// The group of channels that begins with `first_of_group`; 0 where they are few.
@@ -29,35 +34,34 @@ template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int
     launch_group<F, kMovingChannels, kSide>(p, first, stream);
 }
 
+/// Calls f with the footprint and, as a constant, the side of the tiles.
+template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
+  visit_pixels(footprint, [&](auto chosen) {
+    using F = decltype(chosen);
+    if constexpr (F::kMoves) with_tile_side<F>(grid, [&](auto side) { f(chosen, side); });
+  });
+}
+
 }  // namespace
 
 int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid) {
   int64_t numbers = 0;
-  visit_pixels(footprint, [&](auto f) {
+  if (cut.max_segments == 0) return 0;
+  visit_tiles(footprint, grid, [&](auto f, auto side) {
     using F = decltype(f);
-    if constexpr (F::kMoves) {
-      if (cut.max_segments == 0) return;
-      with_tile_side<F>(grid, [&](auto side) {
-        constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
-        using Layout = ClaimedLayout<F, kSide>;
-        // Three channels may be rows, whose kernels have kFewChannels.
-        const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
-        numbers = channels > kFewChannels
-                      ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)
-                      : std::max(of_colors, group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments));
-      });
-    }
+    constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
+    using Layout = ClaimedLayout<F, kSide>;
+    const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
+    numbers = channels > kFewChannels
+                  ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)
+                  : std::max(of_colors, group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments));
   });
   return numbers;
 }
 
 void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (F::kMoves) {
-      with_tile_side<F>(p.grid, [&](auto side) { launch_blend_vjp<F, decltype(side)::value>(p, first, stream); });
-    }
-  });
+  visit_tiles(footprint, p.grid,
+              [&](auto f, auto side) { launch_blend_vjp<decltype(f), decltype(side)::value>(p, first, stream); });
 }
 
 }  // namespace ar::cuda

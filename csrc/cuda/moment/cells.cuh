@@ -9,26 +9,26 @@
 
 namespace ar::cuda {
 
-/// The group of pixels that the calling warp works on, with a layout whose groups are claimed (kTaken of CellLayout,
+/// The group of pixels that the calling warp works on, with a layout whose groups are claimed (kClaimed of CellLayout,
 /// vjp_segments.cuh).
-__device__ inline int& taken_group() {
+__device__ inline int& claimed_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
 }
 
 /// How the samples of a tile of kSide x kSide pixels are shared out. Each lane has kCells cells. The cells of one pixel
 /// are in kLanes neighbouring lanes (a power of two). The pixels of a warp, a group, are a rectangle. The groups of a
-/// tile are spread over kBlocks blocks of kWarps warps; kWarpsOfGroup warps share a group. kTaken: a warp claims one
+/// tile are spread over kBlocks blocks of kWarps warps; kWarpsOfGroup warps share a group. kClaimed: a warp claims one
 /// group after the other, instead of having one.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
-          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false,
+          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kClaimed = false,
           int kWarpsOfGroup = 1>
 struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
   static constexpr int kSide = kSideOfTile, kTilePixels = kSide * kSide;
   static constexpr int kGroups = kLanes * kTilePixels / 32;
   static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps;
-  static constexpr int kBlocks = kTaken ? 1 : kGroups * kWarpsOfGroup / kWarps;
+  static constexpr int kBlocks = kClaimed ? 1 : kGroups * kWarpsOfGroup / kWarps;
   static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups * kWarpsOfGroup % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
@@ -36,7 +36,7 @@ struct CellLayout {
 
   /// This warp's group.
   __device__ static int group() {
-    if constexpr (kTaken) return taken_group();
+    if constexpr (kClaimed) return claimed_group();
     return (int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32) / kWarpsOfGroup;
   }
   /// The number of the group's pixel i in the tile, row by row, whatever the layout.
@@ -55,16 +55,16 @@ struct CellLayout {
   /// Whether this lane writes its samples: AheadLayout has the same sample in several lanes.
   __device__ static bool owns() { return true; }
 
-  /// Bit w: the splat reaches the pixels of warp w of this block (of group w with kTaken), or passes them closely. The
-  /// tile begins at (x0, y0).
+  /// Bit w: the splat reaches the pixels of warp w of this block (of group w with kClaimed), or passes them closely.
+  /// The tile begins at (x0, y0).
   template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
     constexpr int kOfBlock = kGroups / kBlocks;
     static_assert(kOfBlock % kColumns == 0);
-    const int rows = kTaken ? 0 : int(blockIdx.x) % kBlocks * kOfBlock / kColumns;  // of the blocks before
+    const int rows = kClaimed ? 0 : int(blockIdx.x) % kBlocks * kOfBlock / kColumns;  // of the blocks before
     return reached_boxes<kWide, kHigh, kColumns, kOfBlock / kColumns, F>(splat, x0, y0 + rows * kHigh);
   }
   /// The bit of block_reach() of this warp's pixels.
-  __device__ static int own_bit() { return kTaken ? group() : int(threadIdx.x) / 32; }
+  __device__ static int own_bit() { return kClaimed ? group() : int(threadIdx.x) / 32; }
 
   /// The sum over the lanes of a pixel, in each of them.
   __device__ static float sum_lanes(float x) {
@@ -78,16 +78,15 @@ struct CellLayout {
 /// do, forward and backward. Where cuts_all_lists(), such lists are only those of frames with more pairs than room.
 template <class F, int kSide>
 using EvenLayout =
-    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
-                       std::conditional_t<F::kSamples == 4, CellLayout<2, 2>, CellLayout<(F::kSamples + 3) / 4, 4>>>;
+    std::conditional_t<(kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>, CellLayout<F::kSide, F::kSide, kSide>>;
 
 /// Where the checkpoints of a tile's samples are: the checkpoint before pair i spacing, i > 0, has number first + i
 /// - 1. The tiles of a patch share the room of its list equally.
-struct StatePlaces {
+struct TileCheckpoints {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
 
-  __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
+  __device__ TileCheckpoints(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
       : first(lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
     if (!list.of_patch) return;
     const TileInPatch of_patch(lists, grid, tile);
@@ -95,8 +94,10 @@ struct StatePlaces {
     first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
-  /// The number of the checkpoint before chunk k / kStateChunk, where every chunk but the first has one.
-  __device__ int64_t of_chunk_at(int k) const { return first + k / kStateChunk - 1; }
+  /// The checkpoint before pair k, where each chunk of kStateChunk pairs but the first has one.
+  template <class Samples> __device__ float* at(float* checkpoints, int k) const {
+    return checkpoints + (first + k / kStateChunk - 1) * Samples::kCheckpoint;
+  }
 };
 
 /// The terms of a splat for the cells of a tile: lengths are in edges of cells.
@@ -114,14 +115,14 @@ template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide <
 template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
-  Vec2<float> place[kCells];  ///< position of the node in its cell
+  Vec2<float> position[kCells];  ///< position of the node in its cell
 
   /// Before all splats.
   __device__ explicit MovingSamples(bool inside) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = inside && exists(i) ? 1.0f : -1.0f;
-      place[i] = {0.5f, 0.5f};
+      position[i] = {0.5f, 0.5f};
     }
   }
   __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
@@ -140,12 +141,16 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
-  __device__ void store(float* checkpoint) const {
-    store(checkpoint, [](int) { return true; });
-  }
-  /// Only the samples that load() reads from a checkpoint before pair k.
-  __device__ void store(float* checkpoint, int k, const int (&last)[kCells]) const {
-    store(checkpoint, [&](int i) { return k < last[i]; });
+  /// With `last` only the samples that load() reads from a checkpoint before pair k.
+  __device__ void store(float* checkpoint, int k = 0, const int* last = nullptr) const {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      if (!exists(i) || !Layout::owns() || (last && k >= last[i])) continue;
+      float* to = checkpoint + in_checkpoint(i);
+      to[0] = abs(transmittance[i]);
+      to[kPlane] = position[i].x;
+      to[2 * kPlane] = position[i].y;
+    }
   }
   /// The state before pair k, which `checkpoint` has unless k is 0. Samples that have composited their last splat
   /// before (last[i] <= k) may have no checkpoint there, and need none.
@@ -153,48 +158,40 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
-      place[i] = {0.5f, 0.5f};
+      position[i] = {0.5f, 0.5f};
       if (k == 0 || k >= last[i]) continue;
       const float* from = checkpoint + in_checkpoint(i);
       transmittance[i] = from[0];
-      place[i] = {from[kPlane], from[2 * kPlane]};
+      position[i] = {from[kPlane], from[2 * kPlane]};
     }
   }
+};
 
- private:
-  template <class Wanted> __device__ void store(float* checkpoint, Wanted&& wanted) const {
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
-      if (!exists(i) || !Layout::owns() || !wanted(i)) continue;
-      float* to = checkpoint + in_checkpoint(i);
-      to[0] = abs(transmittance[i]);
-      to[kPlane] = place[i].x;
-      to[2 * kPlane] = place[i].y;
-    }
-  }
+/// A splat at a node: whitened coordinates, and opacity * weight there.
+struct Seen {
+  Vec2<float> z;
+  float raw;
 };
 
 /// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. The rounding of whitened
 /// coordinates does not depend on the layout, so that a backward kernel finds what a forward kernel has composited.
 template <class F, class Layout> struct CellCorners {
-  /// Cells are numbered row by row: cells i and i + kColumns are in one column, and all may be in one row.
-  static constexpr int kColumns = Layout::kCells < F::kSide ? Layout::kCells : F::kSide;
-  static constexpr int kRows = F::kSide % Layout::kCells == 0 ? 1 : Layout::kCells;
-  float left[kColumns], top[kRows];
+  static_assert(F::kSide % Layout::kCells == 0, "the cells of a lane are in one row");
+  float left[Layout::kCells], top;
 
   /// `p`: the pixel, relative to the tile's first.
   __device__ explicit CellCorners(Vec2<float> p) {
     const Vec2<float> corner = {F::kSide * (p.x - 0.5f), F::kSide * (p.y - 0.5f)};
 #pragma unroll
-    for (int i = 0; i < kColumns; ++i) left[i] = corner.x + float((Layout::first_sample() + i) % F::kSide);
-#pragma unroll
-    for (int i = 0; i < kRows; ++i) top[i] = corner.y + float((Layout::first_sample() + i) / F::kSide);
+    for (int i = 0; i < Layout::kCells; ++i) left[i] = corner.x + float((Layout::first_sample() + i) % F::kSide);
+    top = corner.y + float(Layout::first_sample() / F::kSide);
   }
 
-  /// Whitened coordinates of the node of cell i, at position `place` in the cell.
-  template <class Terms> __device__ Vec2<float> node(const Terms& terms, int i, Vec2<float> place) const {
-    const Vec2<float> row = F::whitened_row(terms, top[i % kRows]);
-    return F::whitened_node(terms, row, Vec2<float>{left[i % kColumns] + place.x, place.y});
+  /// The splat at the node of cell i, at `position` in the cell.
+  template <class Terms> __device__ Seen see(const Terms& terms, int i, Vec2<float> position) const {
+    const Vec2<float> at = {left[i] + position.x, position.y};
+    const Vec2<float> z = F::whitened_node(terms, F::whitened_row(terms, top), at);
+    return {z, exp2(F::log_alpha(terms, z))};
   }
 };
 
@@ -217,25 +214,19 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
     return t < kBatch && k + t < end ? list.splat(k + t) : -1;
   }
   /// Loads the splats, `id` = splat_of(), with channels from `first` on.
-  __device__ void load(const float* splats_in, const Channels<float>& channels, int first, const TileList& list,
-                       int32_t id) {
-    if (threadIdx.x < kBatch) load_one(int(threadIdx.x), splats_in, channels, first, list, id);
+  template <class Params> __device__ void load(const Params& params, int first, const TileList& list, int32_t id) {
+    if (threadIdx.x < kBatch) load_one(int(threadIdx.x), params, first, list, id);
   }
   /// Loads splat `id` at index t, or none if it is -1.
-  __device__ void load_one(int t, const float* splats_in, const Channels<float>& channels, int first,
-                           const TileList& list, int32_t id) {
+  template <class Params>
+  __device__ void load_one(int t, const Params& params, int first, const TileList& list, int32_t id) {
     uint32_t bits = 0;
     if (id >= 0) {
-      const Splat<F, float> splat = load_splat<F>(splats_in, id);
+      const Splat<F, float> splat = load_splat<F>(params.splats, id);
       bits = Layout::template block_reach<F>(splat, list.x0, list.y0);
-      if (bits) splats[t] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
+      if (bits) splats[t] = {cell_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
     }
     reach[t] = bits;
-  }
-
-  /// The splats in [k, k + 32) that reach this warp's pixels, in the order of take_first. All lanes must call it.
-  __device__ uint32_t reached(int k) const {
-    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
 
@@ -246,30 +237,19 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
   /// a lane has several cells and a warp so few pixels that often none shows it, but not with kKeep, which takes more
   /// registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
+  Pixel pixel;
   MovingSamples<F, Layout, kTogether> samples;
   CellCorners<F, Layout> corners;
   Values<C> sums = {};
   int last[kCells] = {};  ///< only with kKeep
 
-  /// `p`: the pixel, relative to the tile's first.
-  __device__ MovingBlend(Vec2<float> p, bool inside) : samples(inside), corners(p) {}
+  __device__ MovingBlend(const TileList& list, TileGrid grid)
+      : pixel(list, grid, Layout::pixel()), samples(pixel.inside), corners(Layout::pixel()) {}
 
-  /// Adds what pair k shows in the first sample.
-  __device__ void add(const Blended<float>& b, const Values<C>& channels, int k) {
-    if (b.mask) sums.add(b.if_shown, channels);
-    if (kKeep) last[0] = b.mask ? k + 1 : last[0];
-  }
   /// Composites a splat into the samples; with kKeep shown[i] becomes `index` where it was composited into sample i.
   /// With kVotes all lanes must call it.
   __device__ void add(TileSplatRef<F, C>& splat, int index, int (&shown)[kCells]) {
-    struct Seen {
-      Vec2<float> z;
-      float raw;
-    };
-    const auto see = [&](int i) {
-      const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
-      return Seen{z, exp2(F::log_alpha(splat.terms, z))};
-    };
+    const auto see = [&](int i) { return corners.see(splat.terms, i, samples.position[i]); };
     [[maybe_unused]] Seen seen[kCells] = {};
     if constexpr (kVotes) {
       bool shows = false;
@@ -282,24 +262,24 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     }
     add_samples<kCells>(sums, splat.channels, [&](int i) {
       const auto [z, raw] = kVotes ? seen[i] : see(i);
-      const Blended<float> b =
-          blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
+      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(),
+                                                      samples.transmittance[i], samples.position[i]);
       if (kKeep) shown[i] = b.mask ? index : shown[i];
       return b;
     });
   }
 
   /// Adds the lanes of each pixel up and writes its images. All lanes must call it.
-  __device__ void write(const BlendParams& params, int first, const Pixel& pixel) {
+  __device__ void write(const BlendParams& params, int first) {
     float through = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       if (!samples.exists(i) || !Layout::owns()) continue;
       through += abs(samples.transmittance[i]);
       if (!kKeep || !pixel.inside) continue;
-      const int64_t place = (Layout::first_sample() + i) * pixel.image + pixel.index;
-      params.transmittance[place] = abs(samples.transmittance[i]);
-      params.last[place] = last[i];
+      const int64_t index = (Layout::first_sample() + i) * pixel.image + pixel.index;
+      params.transmittance[index] = abs(samples.transmittance[i]);
+      params.last[index] = last[i];
     }
     through = Layout::sum_lanes(through);
 #pragma unroll

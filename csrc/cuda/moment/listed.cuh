@@ -17,11 +17,6 @@ inline constexpr int kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp reads at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// A warp has kPixelsOfWarp pixels, and each lane a sample. With more pixels a warp takes fewer steps for each, and
-/// more pixels wait for the longest list.
-template <class F, int kSide, int kPixelsOfWarp, int kWarps>
-struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarps> {};
-
 /// Bit x: the span holds pixel x0 + x of a row of kSide pixels. The differences are exact wherever they decide.
 template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float x0) {
   const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kSide))));
@@ -125,25 +120,24 @@ template <class F, int C, int kMostPixels> struct ListedStage {
 /// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels
 /// from `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
-__device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+__device__ void blend_listed(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
   const int lane = lane_id();
-  const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
+  const TileCheckpoints tile_checkpoints(params.lists, list, params.grid, cut.tile);
+  MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
   uint32_t words[kPixels];              // of each pixel, this lane's of a batch
   const auto read_words = [&](int k) {  // of the batch that begins at k
     const int mine = k + 32 * lane;
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
       const uint32_t* from =
-          params.reach_words + pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number(i));
+          params.reach_words + pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number(i));
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
-  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk,
+                                            params.checkpoints + tile_checkpoints.first * blend.samples.kCheckpoint};
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
@@ -182,7 +176,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
     }
     __syncwarp();
   }
-  blend.write(params, first, pixel);
+  blend.write(params, first);
 }
 
 template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
@@ -195,8 +189,8 @@ template <class F, int kSide> struct ListedLayouts {
   /// Other lists: with one sample they have queues too, with four they are walked, with more there are none.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
-  using Long = SampleLayout<F, kSide, 2, kWarps>;  ///< from kLongList pairs on
-  using Short = SampleLayout<F, kSide, kWalked ? 8 : 2, kWarps>;
+  using Long = CellLayout<1, 16, kSide, kWarps>;  ///< from kLongList pairs on
+  using Short = CellLayout<1, kWalked ? 4 : 16, kSide, kWarps>;
   /// Blocks of a list. The first blocks of a short list have its pixels.
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
@@ -215,7 +209,7 @@ template <class F, int kSide> struct ListedLayouts {
 /// The splats that a warp is about to composite, in shared memory.
 template <class F, int C, int kSide> union WarpStage {
   using Layouts = ListedLayouts<F, kSide>;
-  QueuedStage<F, C, Layouts::Longest::kPlaces> queued;
+  QueuedStage<F, C> queued;
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
@@ -226,7 +220,6 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
   using Layouts = ListedLayouts<F, kSide>;
-  using Short = typename Layouts::Short;
   __shared__ WarpStage<F, C, kSide> stages[Layouts::kWarps];
   WarpStage<F, C, kSide>& stage = stages[threadIdx.x / 32];
   const PlanCounts& counts = params.plan.state->counts;
@@ -234,24 +227,18 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
   const int blocks = of_longest + (counts.cut_lists - longest) * Layouts::kOfOthers;
   for (int block = blockIdx.x; block < blocks; block += gridDim.x) {
     const bool is_longest = block < of_longest;
-    const int place = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
-    const CutList cut = params.plan.cut_lists[place];
+    const int index = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
+    const CutList cut = params.plan.cut_lists[index];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
     if (is_longest) {
-      using Longest = typename Layouts::Longest;
-      blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
-      continue;
-    }
-    if constexpr (Layouts::kAhead) {
-      blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
-                                                                   stage.queued);
-    }
-    if constexpr (Layouts::kWalked) {
+      blend_queued<F, C, typename Layouts::Longest, kKeep, kSegment>(params, first, cut, list, stage.queued);
+    } else if constexpr (Layouts::kAhead) {
+      blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut, list, stage.queued);
+    } else if constexpr (Layouts::kWalked) {
       if (list.count >= kLongList) {
-        blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
-                                                                    stage.listed);
-      } else if (block % Layouts::kOfOthers < Short::kBlocks) {
-        blend_listed<F, C, Short, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.listed);
+        blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut, list, stage.listed);
+      } else if (block % Layouts::kOfOthers < Layouts::Short::kBlocks) {
+        blend_listed<F, C, typename Layouts::Short, kKeep, kSegment>(params, first, cut, list, stage.listed);
       }
     }
   }

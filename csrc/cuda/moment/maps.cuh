@@ -14,26 +14,18 @@
 
 namespace ar::cuda {
 
-/// What a sample carries from a splat to the splat before it.
-struct Adjoint {
-  float behind;           ///< gradient-weighted colour of everything farther
-  Vec2<float> dL_dplace;  ///< gradient with respect to the sample's position, times kMoveGradUnit of the footprint
-};
-
 /// How an Adjoint goes through a segment: the image of zero, and what a change of each of the three numbers adds. A
-/// change of the position does not reach `behind`.
+/// change of the position does not reach `later`.
 struct SegmentMap {
   static constexpr int kNumbers = kMapNumbers;
-  Adjoint of_zero, by_behind;
+  Adjoint of_zero, by_later;
   Vec2<float> by_x, by_y;
 
   __device__ Adjoint operator()(const Adjoint& a) const {
-    const auto place = [&](float zero, float behind, float x, float y) {
-      return madd(y, a.dL_dplace.y, madd(x, a.dL_dplace.x, madd(behind, a.behind, zero)));
-    };
-    return {madd(by_behind.behind, a.behind, of_zero.behind),
-            {place(of_zero.dL_dplace.x, by_behind.dL_dplace.x, by_x.x, by_y.x),
-             place(of_zero.dL_dplace.y, by_behind.dL_dplace.y, by_x.y, by_y.y)}};
+    const Vec2<float>&zero = of_zero.dL_dposition, &later = by_later.dL_dposition, &at = a.dL_dposition;
+    return {madd(by_later.later, a.later, of_zero.later),
+            {madd(by_y.x, at.y, madd(by_x.x, at.x, madd(later.x, a.later, zero.x))),
+             madd(by_y.y, at.y, madd(by_x.y, at.x, madd(later.y, a.later, zero.y)))}};
   }
 };
 
@@ -44,25 +36,18 @@ template <class F, int kTilePixels> struct MapMemory {
   float* first;  ///< of the sample
 
   __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
-  __device__ float& at(int64_t piece, int number) const {
-    return first[(piece * SegmentMap::kNumbers + number) * kPlane];
+  /// The numbers of an Adjoint or a SegmentMap from number `from` of the map of a segment on.
+  template <class Numbers> __device__ Numbers get(int64_t segment, int from = 0) const {
+    float numbers[sizeof(Numbers) / sizeof(float)];
+    for (float& number : numbers) number = first[(segment * SegmentMap::kNumbers + from++) * kPlane];
+    Numbers all;
+    memcpy(&all, numbers, sizeof all);
+    return all;
   }
-  __device__ Adjoint adjoint(int64_t piece, int number = 0) const {
-    return {at(piece, number), {at(piece, number + 1), at(piece, number + 2)}};
-  }
-  __device__ SegmentMap map(int64_t piece) const {
-    return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
-  }
-  __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
-    at(piece, number) = a.behind;
-    at(piece, number + 1) = a.dL_dplace.x;
-    at(piece, number + 2) = a.dL_dplace.y;
-  }
-  __device__ void put(int64_t piece, const SegmentMap& m) const {
-    put(piece, m.of_zero);
-    put(piece, m.by_behind, 3);
-    at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
-    at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
+  template <class Numbers> __device__ void put(int64_t segment, const Numbers& all, int from = 0) const {
+    float numbers[sizeof(Numbers) / sizeof(float)];
+    memcpy(numbers, &all, sizeof all);
+    for (float number : numbers) first[(segment * SegmentMap::kNumbers + from++) * kPlane] = number;
   }
 };
 
@@ -83,78 +68,58 @@ template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, k
 __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
     segment_maps_kernel(const BlendVjpParams params, int first) {
   wait_for_earlier_kernels();
-  using Samples = MovingSamples<F, Layout, true>;
-  constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
+  using Lane = VjpLane<F, C, Layout, true>;
+  using Samples = typename Lane::Samples;
+  constexpr int kBatch = std::min(Layout::kThreads, 256);
+  static_assert(Layout::kCells == 1);
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   __shared__ int last_of_warps[Layout::kWarps];
   const ListSegment segment(*params.plan, params.chunk_order, int(blockIdx.x) / Layout::kBlocks);
   if (segment.tile < 0 || segment.index == 0) return;
   const TileList list = list_of(params.lists, params.grid, segment.tile);
-  const StatePlaces places(params.lists, list, params.grid, segment.tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  const SampleGrad<F, C> grad(params, pixel, first);
-  const CellCorners<F, Layout> corners(p);
-  Samples samples(pixel.inside);
-  const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
-  const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
-  const auto checkpoint_at = [&](int k) { return params.checkpoints + places.of_chunk_at(k) * Samples::kCheckpoint; };
-  samples.load(checkpoint_at(begin), begin, last.samples);
-  AdjointMap<float> maps[kCells];
-  float before[kCells];  // the transmittance
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) {
-    maps[i] = {0, {0, 0}, {0, 0}, {1, 0, 0, 1}};
-    before[i] = samples.transmittance[i];
-  }
+  const TileCheckpoints tile_checkpoints(params.lists, list, params.grid, segment.tile);
+  Lane lane(params, list);
+  lane.begin(params, first, WantedSums<C>(params, first));
+  Samples& samples = lane.samples;
+  const int begin = segment.index * kSegment, end = begin + kSegment, last = lane.last.samples[0];
+  const int stop = min(lane.last.of_block(last_of_warps), end);
+  samples.load(tile_checkpoints.at<Samples>(params.checkpoints, begin), begin, lane.last.samples);
+  const float before = samples.transmittance[0];
+  AdjointMap<float> map = {0, {0, 0}, {0, 0}, {1, 0, 0, 1}};
   int32_t id = stage.splat_of(list, begin, stop);
   for (int k = begin; k < stop; k += kBatch) {
-    const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
+    const int count = min(kBatch, min(lane.last.warp, stop) - k);  // of what this warp needs
     const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
     __syncthreads();  // all have read the last batch
-    stage.load(params.splats, params.channels, first, list, id);
+    stage.load(params, first, list, id);
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kStateChunk) {
-      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last.samples);
+      if (first == 0 && k + from > begin)
+        samples.store(tile_checkpoints.at<Samples>(params.checkpoints, k + from), k + from, lane.last.samples);
       const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
       stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];
-        Vec2<float> z[kCells];
-        float raw[kCells];
-        bool mask[kCells], any = false;
-#pragma unroll
-        for (int i = 0; i < kCells; ++i) {
-          z[i] = corners.node(splat.terms, i, samples.place[i]);
-          raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
-          mask[i] = raw[i] >= float(kAlphaMin) && k + int(j) < last.samples[i];
-          any |= mask[i];
-        }
-        if (!__any_sync(kAllLanes, any)) return;
-        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
-#pragma unroll
-        for (int i = 0; i < kCells; ++i)
-          map_placed_sample<F>(splat.terms, z[i], raw[i], mask[i], UnitCell<F::kSide>(), g_color,
-                               samples.transmittance[i], samples.place[i], maps[i]);
+        const auto [z, raw] = lane.corners.see(splat.terms, 0, samples.position[0]);
+        const bool mask = raw >= float(kAlphaMin) && k + int(j) < last;
+        if (!__any_sync(kAllLanes, mask)) return;
+        const float g_color = lane.grad.times(splat.channels, params, lane.pixel, [&] { return list.splat(k + j); });
+        map_placed_sample<F>(splat.terms, z, raw, mask, UnitCell<F::kSide>(), g_color, samples.transmittance[0],
+                             samples.position[0], map);
       });
       __syncwarp();  // all have read the list
     }
   }
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) {
-    if (last.samples[i] <= begin) continue;
-    const AdjointMap<float>& m = maps[i];
-    SegmentMap map = {{divide(m.color, before[i]), m.of_color},
-                      {divide(samples.transmittance[i], before[i]), m.of_behind},
-                      {m.of_place.xx, m.of_place.yx},
-                      {m.of_place.xy, m.of_place.yy}};
-    // After the segment with a sample's last splat there is only the background.
-    if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
-    const MapMemory<F, Layout::kTilePixels> memory(params.adjoint_maps, Layout::first_sample() + i,
-                                                   Layout::pixel_number());
-    memory.put(segment.number, map);
-  }
+  if (last <= begin) return;
+  SegmentMap m = {{divide(map.color, before), map.of_color},
+                  {divide(samples.transmittance[0], before), map.of_behind},
+                  {map.of_place.xx, map.of_place.yx},
+                  {map.of_place.xy, map.of_place.yy}};
+  // After the segment with a sample's last splat there is only the background.
+  if (last <= end) m.of_zero = m(lane.adjoint[0]);
+  using Memory = MapMemory<F, Layout::kTilePixels>;
+  Memory(params.adjoint_maps, Layout::first_sample(), Layout::pixel_number()).put(segment.number, m);
 }
 
 /// A thread per sample of a tile whose list is cut: applies the maps of its segments, from the last to the first.
@@ -162,11 +127,11 @@ template <class F, int kSide, int kSegment>
 __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kPixels = kSide * kSide;
-  const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
+  const int index = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
   if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;  // for segment_vjp_kernel
-  if (place >= params.plan->counts.cut_lists) return;
-  const CutList cut = params.cut_lists[place];
+  if (index >= params.plan->counts.cut_lists) return;
+  const CutList cut = params.cut_lists[index];
   const TileList list = list_of(params.lists, params.grid, cut.tile);
   const Pixel pixel(list, params.grid, {float(number % kSide), float(number / kSide)});
   if (!pixel.inside) return;
@@ -175,11 +140,11 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   if (segment <= 1) return;
   const int64_t first = cut.first;
   const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
-  Adjoint adjoint = memory.adjoint(first + segment);
+  Adjoint adjoint = memory.template get<Adjoint>(first + segment);
   for (; segment > 1; segment -= kMapsAhead) {
     SegmentMap maps[kMapsAhead];
 #pragma unroll
-    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
 #pragma unroll
     for (int i = 0; i < kMapsAhead; ++i) {
       if (segment - 1 - i < 1) return;

@@ -15,14 +15,11 @@ template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
 struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
   /// Samples that a warp has of a pixel, and lanes of a sample.
-  static constexpr int kOfWarp = (F::kSamples + kWarpsOfPixel - 1) / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
-  static_assert(kAhead > 0 && (Base::kLanes % kOfWarp == 0 || Base::kLanes == 32));
+  static constexpr int kOfWarp = F::kSamples / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
+  static_assert(kOfWarp * kWarpsOfPixel == F::kSamples && kOfWarp * kAhead == Base::kLanes);
   static_assert(kWarpsOfPixel == 1 || kPixelsOfWarp == 1);
-  /// Staged splats: 32, and empty ones up to a multiple of kAhead, as the lanes of a sample test kAhead at once.
-  static constexpr int kPlaces = (32 + kAhead - 1) / kAhead * kAhead;
   __device__ static int first_sample() {
-    const int of_warp = lane_id() % Base::kLanes / kAhead;
-    return of_warp < kOfWarp ? int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + of_warp : F::kSamples;
+    return int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + lane_id() % Base::kLanes / kAhead;
   }
   /// This lane's number among the lanes of its sample.
   __device__ static int ahead() { return lane_id() % kAhead; }
@@ -130,20 +127,12 @@ template <class Layout> struct PairQueues {
     }
     __syncwarp();
   }
-  /// How many there are for the lanes of the pixel, one each, and this lane's.
-  __device__ int ready() const { return min(int(end - begin), Layout::kLanes); }
-  __device__ int pair() const { return pairs[(begin + uint32_t(lane)) % kRoom]; }
-  /// Drops the pairs of the pixel, and all that follow.
-  __device__ void close() {
-    count = 0;
-    begin = end;
-  }
 };
 
 /// The splats that each pixel of a warp is about to composite, and the queues that they come from, in shared memory.
-template <class F, int C, int kPlaces> struct QueuedStage {
-  TileSplat<F, C> splats[kPlaces];
-  int32_t pairs[kPlaces];
+template <class F, int C> struct QueuedStage {
+  TileSplat<F, C> splats[32];
+  int32_t pairs[32];
   int32_t queues[kQueued];
 };
 
@@ -172,9 +161,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
     take_next(queues);
   }
   template <class Queues> __device__ void take_next(Queues& queues) {
-    next_n = queues.ready();
+    next_n = min(int(queues.end - queues.begin), Layout::kLanes);  // one for each lane of the pixel
     if (queues.lane < next_n) {
-      next_pair = queues.pair();
+      next_pair = queues.pairs[(queues.begin + uint32_t(queues.lane)) % Queues::kRoom];
       next_id = list.splat(next_pair);
     }
     queues.begin += uint32_t(next_n);
@@ -200,7 +189,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   constexpr bool kOnce = kAhead == Layout::kLanes;  // a sample has a lane for each of the staged splats
   const int own = lane_id(), first_lane = Layout::first_sharer();
   float& transmittance = blend.samples.transmittance[0];
-  Vec2<float>& place = blend.samples.place[0];
+  Vec2<float>& position = blend.samples.position[0];
   int taken = first_staged + Layout::ahead();  // the splat of this lane, if there is one
   int left = n;                                // splats from the one of the sample's first lane on
   auto splat = stage.splats[taken];
@@ -215,23 +204,25 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   const auto lanes_at_checkpoint = [&] { return kKeep ? __ballot_sync(kAllLanes, pair >= checkpoints.pair) : 0u; };
   uint32_t at_checkpoint = lanes_at_checkpoint();
   while (true) {
-    const Vec2<float> z = blend.corners.node(splat.terms, 0, place);
-    const float raw = exp2(F::log_alpha(splat.terms, z));
+    const auto [z, raw] = blend.corners.see(splat.terms, 0, position);
     const bool hit = (live >> own & 1) != 0 && raw >= float(kAlphaMin);
     const uint32_t all_hits = __ballot_sync(kAllLanes, hit), hits = all_hits & Layout::sharers();
     if (kOnce && all_hits == 0) break;
     const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, if there is one
     float left_over = transmittance;
-    Vec2<float> moved = place;
+    Vec2<float> moved = position;
     const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), left_over, moved);
-    if (first == own) blend.add(b, splat.channels, pair);
+    if (first == own) {
+      if (b.mask) blend.sums.add(b.if_shown, splat.channels);
+      if (kKeep) blend.last[0] = b.mask ? pair + 1 : blend.last[0];
+    }
     if (kKeep && (hits & -hits & at_checkpoint) != 0)
       checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
     left_over = shuffle(left_over, first);
     moved = {shuffle(moved.x, first), shuffle(moved.y, first)};
     if (hits != 0) {
       transmittance = left_over;
-      place = moved;
+      position = moved;
       live = left_over > 0 ? live & (kAllLanes - 1) << first : 0;
     }
     if constexpr (!kOnce) {
@@ -252,18 +243,17 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
 /// Blends the pixels of a warp, as Layout shares them out, by queues; C channels from `first` on. `first_segment`: the
 /// number of the list's first segment. `kKeep`, `kSegment`: for a backward pass with segments of so many pairs.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
-__device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+__device__ void blend_queued(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kLanes = Layout::kLanes;
-  const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
-  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  const TileCheckpoints tile_checkpoints(params.lists, list, params.grid, cut.tile);
+  MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk,
+                                            params.checkpoints + tile_checkpoints.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
-  const int64_t words = pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number());
+  const int64_t words = pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
-                pixel.inside ? list.count : 0);
+                blend.pixel.inside ? list.count : 0);
   // While splats are composited, the next ones are read, and the numbers of the ones after those.
   QueuedSplats<F, C, Layout> next(params, list, first);
   next.take_next(queues);
@@ -279,13 +269,13 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
     __syncwarp();
     blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, checkpoints);
     if (!(__ballot_sync(kAllLanes, blend.samples.open()) & lanes_of_pixel)) {
-      queues.close();
+      queues.count = 0, queues.begin = queues.end;
       next.n = next.next_n = 0;
     }
     __syncwarp();  // all have read the splats
   }
   if constexpr (kKeep) blend.last[0] = Layout::max_of_sharers(blend.last[0]);
-  blend.write(params, first, pixel);
+  blend.write(params, first);
 }
 
 }  // namespace ar::cuda

@@ -6,16 +6,30 @@
 
 namespace ar::cuda {
 
+/// Which sums of a pair a kernel for C channels from `first` on makes, besides those of its channels.
+template <int C> struct WantedSums {
+  static constexpr bool kMany = C > kFewChannels;  ///< `first` may be above 0, and there may be more channels than C
+  bool shape;                                      ///< PairGrad
+  bool means;                                      ///< MeanSums
+  bool others;                                     ///< with the share of the channels of other kernels
+
+  __device__ WantedSums(const BlendVjpParams& params, int first) {
+    const bool is_first = !kMany || first == 0;
+    shape = is_first || params.mean_sums == MeanSums::kNone;
+    means = is_first && params.mean_sums != MeanSums::kNone;
+    others = kMany && means && params.channels.count > C;
+  }
+};
+
 /// The gradient with respect to a sample of a lane's pixel.
 template <class F, int C> struct SampleGrad {
   Values<C> channels;  ///< from `first` on
-  float through = 0;   ///< scalar product with the background
-  /// Whether this kernel, the first of several groups of channels, adds the others' share of the gradient of alpha.
-  bool with_others;
+  float through;       ///< scalar product with the background
+  bool with_others;    ///< WantedSums::others
 
-  __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first)
-      : with_others(C > kFewChannels && params.mean_sums != MeanSums::kNone && params.channels.count > C &&
-                    first == 0) {
+  __device__ void read(const BlendVjpParams& params, const Pixel& pixel, int first, WantedSums<C> wanted) {
+    with_others = wanted.others;
+    through = 0;
 #pragma unroll
     for (int c = 0; c < C; ++c) {
       channels.v[c] = sample_gradient<F>(params, pixel, first + c);
@@ -59,19 +73,46 @@ template <class F, class Layout> struct SamplesLast {
     }
     warp = warp_max(warp);
   }
-};
-/// The same, and into any sample of its block.
-template <class F, class Layout> struct LastSplats : SamplesLast<F, Layout> {
-  using SamplesLast<F, Layout>::warp;
-  int block = 0;
-
-  /// `of_warps`: in shared memory. All threads of a block must call it.
-  __device__ LastSplats(const int32_t* last, const Pixel& pixel, int (&of_warps)[Layout::kWarps])
-      : SamplesLast<F, Layout>(last, pixel) {
+  /// The same for any sample of the block. `of_warps`: in shared memory. All threads of a block must call it.
+  __device__ int of_block(int (&of_warps)[Layout::kWarps]) const {
     if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
     __syncthreads();
+    int block = 0;
 #pragma unroll
     for (int w = 0; w < Layout::kWarps; ++w) block = max(block, of_warps[w]);
+    return block;
+  }
+};
+
+/// What a sample carries from a splat to the splat before it.
+struct Adjoint {
+  float later;               ///< gradient-weighted colour of everything later in the list
+  Vec2<float> dL_dposition;  ///< times kMoveGradUnit of the footprint
+};
+
+/// A lane of a backward kernel: its pixel, and its samples on their way through a list.
+template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout>> struct VjpLane {
+  static constexpr int kCells = Layout::kCells;
+  using Samples = MovingSamples<F, Layout, kTogether>;
+  Pixel pixel;
+  CellCorners<F, Layout> corners;
+  Samples samples;
+  SamplesLast<F, Layout> last;
+  SampleGrad<F, C> grad;
+  Adjoint adjoint[kCells];
+
+  /// All lanes must call it.
+  __device__ VjpLane(const BlendVjpParams& params, const TileList& list)
+      : pixel(list, params.grid, Layout::pixel()),
+        corners(Layout::pixel()),
+        samples(pixel.inside),
+        last(params.last, pixel) {}
+  /// Reads the gradient of the image. Sets `adjoint` to what it is after all splats, where there is only the
+  /// background.
+  __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
+    grad.read(params, pixel, first, wanted);
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
   }
 };
 

@@ -3,88 +3,80 @@
 // write_pairs adds up the warps and writes rows of pair_grads and channel_sums.
 #pragma once
 
-#include <algorithm>
-
-#include "cuda/moment/cells.cuh"
+#include "cuda/moment/vjp_grads.cuh"
 
 namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
-/// write_pairs() for kUsed sums of each pair, a constant so that divisions by it cost little.
-template <int kUsed, int C, int kThreads, class Total>
-__device__ void write_sums(const BlendVjpParams& params, int first, bool with_shape, const TileList& list,
-                           const int32_t* rows, int count, Total&& total) {
-  constexpr bool kMany = C > kFewChannels;
-  constexpr int kMeans = 6 + C;
-  for (int t = int(threadIdx.x); t < count * kUsed; t += kThreads) {
-    const int j = t / kUsed, v = t % kUsed;
-    float sum = total(j, v);
-    const int32_t row = rows[j];
-    const auto put = [&](int column) {
-      if (kMany && first > 0 && !list.of_patch) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-      put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
-    };
-    if (v >= 6 && v < kMeans) {
-      if (kMany) {
-        put_sum(params.channel_sums, kChannelGroup, list.of_patch, row, first % kChannelGroup + v - 6, sum);
-      } else {
-        put(v == 9 ? kPairFourthChannel : v);
-      }
-    } else if (with_shape) {
-      put(v < 6 ? v : kPairMeans + v - kMeans);
-    }
-  }
-}
-
-/// Writes the sums total(j, v) of the first `count` pairs of a batch: C channels from `first` on, with_shape the six
-/// sums of PairGrad, and with_means MeanSums. To the six sums it adds what the kernels of earlier channels have
-/// written. `rows`: [count] row of each pair.
-template <int C, int kThreads, class Total>
-__device__ void write_pairs(const BlendVjpParams& params, int first, bool with_means, bool with_shape,
-                            const TileList& list, const int32_t* rows, int count, Total&& total) {
-  constexpr int kMeans = 6 + C;
-  if (with_means) {
-    write_sums<kMeans + 2, C, kThreads>(params, first, with_shape, list, rows, count, total);
-  } else {
-    write_sums<kMeans, C, kThreads>(params, first, with_shape, list, rows, count, total);
-  }
-}
-
-/// What a block of moving_vjp_kernel keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
-template <class F, int C, class Layout> struct MovingVjpShared {
+/// A batch of pairs that a backward block works on, in shared memory.
+template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatch {
+  static constexpr int kBatch = kPairs, kChunks = kPairs / kStateChunk;
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// Splats between barriers: two chunks with one cell of a lane; with more cells one, which leaves more shared memory
-  /// for the positions of samples.
-  static constexpr int kBatch = Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, kChunks = kBatch / kStateChunk;
-  MovingStage<F, C, Layout, kBatch> stage;
-  float sums[Layout::kWarps][kBatch][kSums];  ///< of a warp's pixels
-  uint32_t hits[Layout::kWarps][kChunks];     ///< splats that have sums of a warp
-  int32_t rows[kBatch];
-  Mat2<float> mean_maps[kBatch];
-  int last[Layout::kWarps];  ///< of LastSplats
+  /// What a group writes for each pair: PairGrad, C channels, MeanSums.
+  using Sums = float[kPairs][kSums];
+  MovingStage<F, C, Layout, kPairs> stage;
+  uint32_t hits[Layout::kGroups][kChunks];  ///< pairs that have sums of a group
+  int32_t rows[kPairs];
+  Mat2<float> mean_maps[kPairs];
+  std::conditional_t<kInside, Sums[Layout::kGroups], char> inside;  ///< of each group
 
-  /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on, and with_means
-  /// also what MeanSums need. All threads must call it.
-  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list, int k0,
-                       int32_t id, bool with_means) {
-    stage.load(params.splats, params.channels, first, list, id);
-    if (id >= 0) {
-      const int t = threadIdx.x;
-      rows[t] = list.slot(k0 + t);
-      if (with_means) mean_maps[t] = F::mean_map(load_splat<F>(splats, id).shape);
+  /// Loads splat `id` of pair k0 + t, if it is not -1, with channels from `first` on.
+  __device__ void load(int t, const BlendVjpParams& params, int first, const TileList& list, int k0, int32_t id,
+                       bool with_means) {
+    stage.load_one(t, params, first, list, id);
+    if (id < 0) return;
+    rows[t] = list.slot(k0 + t);
+    if (with_means) mean_maps[t] = F::mean_map(load_splat<F>(params.splats, id).shape);
+  }
+  __device__ bool is_hit(int group, int j) const { return hits[group][j / kStateChunk] >> (j % kStateChunk) & 1; }
+
+  /// Writes the sums total(j, v) of the first `count` pairs. To the six sums it adds what the kernels of earlier
+  /// channels have written.
+  template <class Total>
+  __device__ void write(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list, int count,
+                        Total&& total) const {
+    if (wanted.means) {
+      write_first<kSums>(params, first, wanted, list, count, total);
+    } else {
+      write_first<kMeans>(params, first, wanted, list, count, total);
     }
   }
-  /// Value v of the sums of all warps for pair j.
-  __device__ float total(int j, int v) const {
-    float sum = 0;
-#pragma unroll
-    for (int w = 0; w < Layout::kWarps; ++w) {
-      if (hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += sums[w][j][v];
+
+ private:
+  /// The first kUsed sums of each pair: a constant, so that divisions by it cost little.
+  template <int kUsed, class Total>
+  __device__ void write_first(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list,
+                              int count, Total&& total) const {
+    for (int t = int(threadIdx.x); t < count * kUsed; t += Layout::kThreads) {
+      const int j = t / kUsed, v = t % kUsed;
+      float sum = total(j, v);
+      const int32_t row = rows[j];
+      const auto put = [&](int column) {
+        if (wanted.kMany && first > 0 && !list.of_patch)
+          sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+        put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
+      };
+      if (v >= 6 && v < kMeans) {
+        if (wanted.kMany) {
+          put_sum(params.channel_sums, kChannelGroup, list.of_patch, row, first % kChannelGroup + v - 6, sum);
+        } else {
+          put(v == 9 ? kPairFourthChannel : v);
+        }
+      } else if (wanted.shape) {
+        put(v < 6 ? v : kPairMeans + v - kMeans);
+      }
     }
-    return sum;
   }
 };
+
+/// Clears the rows of the pairs [begin, end), which nothing reached.
+template <int kThreads>
+__device__ void clear_pairs(const BlendVjpParams& params, const TileList& list, int begin, int end, int first) {
+  if (first % kChannelGroup != 0 || list.of_patch) return;
+  for (int k = begin + int(threadIdx.x) / kClearThreads; k < end; k += kThreads / kClearThreads)
+    clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
+}
 
 /// The number of the sum that a lane has after put_warp_sums.
 template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
@@ -93,11 +85,8 @@ template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewCh
 /// call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
-  const float of_shape[6] = {shape.offset.x, shape.offset.y, shape.shape.xx,
-                             shape.shape.xy, shape.shape.yy, grad.weighted};
-  float values[C <= kFewChannels ? 6 + C : 8] = {};
-#pragma unroll
-  for (int v = 0; v < 6; ++v) values[v] = of_shape[v];
+  float values[C <= kFewChannels ? 6 + C : 8] = {shape.offset.x, shape.offset.y, shape.shape.xx,
+                                                 shape.shape.xy, shape.shape.yy, grad.weighted};
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];

@@ -28,150 +28,141 @@ inline constexpr int kMovingVjpBlocks =
 /// The positions of a lane's samples before each splat of a chunk that reaches its warp. Positions before the first few
 /// splats are in shared memory, as far as there is room, the others in local memory, of which the caches hold only a
 /// part.
-template <class Layout> class EarlierPositions {
+template <class Layout> struct EarlierPositions {
   static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
   struct alignas(kTogether * sizeof(Vec2<float>)) Together {
     Vec2<float> of[kTogether];
   };
   using OfWarp = Together[kCells / kTogether][32];
-
- public:
   using Positions = Vec2<float>[kCells];
   /// Bytes of shared memory that a block needs for each splat.
   static constexpr size_t kBytes = Layout::kWarps * sizeof(OfWarp);
   /// The number of splats whose positions are in shared memory is a multiple of this number.
   static constexpr int kUnit = kListAhead<Layout>;
 
+  int begin, in_shared;
+  Together local[kStateChunk][kCells / kTogether];
+
   /// The shared memory from byte `begin` on is for the positions before so many splats.
   __device__ EarlierPositions(size_t begin, int splats)
-      : begin_(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared_(splats) {}
-
-  __device__ int in_shared() const { return in_shared_; }
-  /// The number of splats that leaves room for so many blocks on a multiprocessor, each with `bytes` more of shared
-  /// memory.
-  static int in_shared_of_blocks(int blocks, size_t bytes) {
-    const size_t room = shared_bytes_of_blocks(blocks), splats = room > bytes ? (room - bytes) / kBytes : 0;
-    return int(std::min<size_t>(splats, kMostInShared)) / kUnit * kUnit;
+      : begin(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared(splats) {}
+  /// Not a member: the compiler has to see that it points to shared memory.
+  __device__ OfWarp* shared() const {
+    return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin);
   }
-
-  /// Before splat n of the list; kShared: n < in_shared().
+  /// Before splat n of the list; kShared: n < in_shared.
   template <bool kShared> __device__ void put(int n, const Positions& positions) {
 #pragma unroll
     for (int i = 0; i < kCells; i += kTogether) {
       Together together;
 #pragma unroll
       for (int j = 0; j < kTogether; ++j) together.of[j] = positions[i + j];
-      if constexpr (kShared) {
-        shared()[n][i / kTogether][lane_id()] = together;
-      } else {
-        local_[n][i / kTogether] = together;
-      }
+      (kShared ? shared()[n][i / kTogether][lane_id()] : local[n][i / kTogether]) = together;
     }
   }
   __device__ void get(int n, Positions& positions) const {
-    if (n < in_shared_) {
-      read([&](int i) { return shared()[n][i][lane_id()]; }, positions);
-    } else {
-      read([&](int i) { return local_[n][i]; }, positions);
-    }
-  }
-
- private:
-  /// Not a member: the compiler has to see that it points to shared memory.
-  __device__ OfWarp* shared() const {
-    return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin_);
-  }
-  template <class From> __device__ static void read(From&& from, Positions& positions) {
+    const bool is_shared = n < in_shared;
 #pragma unroll
     for (int i = 0; i < kCells; i += kTogether) {
-      const Together together = from(i / kTogether);
+      Together together;
+      if (is_shared) together = shared()[n][i / kTogether][lane_id()];
+      if (!is_shared) together = local[n][i / kTogether];
 #pragma unroll
       for (int j = 0; j < kTogether; ++j) positions[i + j] = together.of[j];
     }
   }
-
-  int begin_, in_shared_;
-  Together local_[kStateChunk][kCells / kTogether];
 };
 
 /// Composites the staged splats in [from, from + 32) that reach the warp, and lists them; `k0`: the pair that is staged
 /// first. Stores the positions of the samples before each in `earlier` (EarlierPositions, or null), and returns which
-/// listed splats a sample of the warp shows. `last`: of LastSplats.
-template <class F, class Layout, class Stage, class Samples, class Earlier>
-__device__ uint32_t replay_chunk(Stage& stage, int from, int k0, const CellCorners<F, Layout>& corners,
-                                 const int (&last)[Layout::kCells], Samples& samples, Earlier earlier) {
+/// listed splats a sample of the warp shows.
+template <class Stage, class F, int C, class Layout, bool kTogether, class Earlier>
+__device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, Layout, kTogether>& lane,
+                                 Earlier earlier) {
   constexpr bool kKeeps = !std::is_null_pointer_v<Earlier>;
+  auto& samples = lane.samples;
   __syncwarp();  // all have read the last list
   const int listed = stage.lists.list(stage.reach, from, from + kStateChunk, Layout::own_bit());
   uint32_t shown = 0;
   int n = 0;
   const auto composite = [&](uint32_t entry, auto is_shared) {
     const auto& terms = Stage::Lists::splat_of(stage.splats, entry).terms;
-    if constexpr (kKeeps) earlier->template put<decltype(is_shared)::value>(n, samples.place);
+    if constexpr (kKeeps) earlier->template put<decltype(is_shared)::value>(n, samples.position);
     bool any = false;
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
-      const Vec2<float> z = corners.node(terms, i, samples.place[i]);
-      any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k0 + int(entry) < last[i],
-                                     UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
+      const auto [z, raw] = lane.corners.see(terms, i, samples.position[i]);
+      any |= replay_placed_sample<F>(terms, z, raw, k0 + int(entry) < lane.last.samples[i], UnitCell<F::kSide>(),
+                                     samples.transmittance[i], samples.position[i]);
     }
     if (any) shown |= 1u << n;
     ++n;
   };
   int in_shared = listed;
-  if constexpr (kKeeps) in_shared = min(in_shared, earlier->in_shared());
+  if constexpr (kKeeps) in_shared = min(in_shared, earlier->in_shared);
   stage.lists.for_each(0, in_shared, [&](uint32_t entry) { composite(entry, std::true_type()); });
   if constexpr (kKeeps)
     stage.lists.for_each(in_shared, listed, [&](uint32_t entry) { composite(entry, std::false_type()); });
   return warp_or(shown);
 }
 
-/// Takes a lane's samples and their Adjoint from after pair j of the batch that begins with pair k0 to before it, where
-/// the samples are at `positions`. Returns the sums over the samples. `g_color`: the scalar product of
-/// the splat's channels and the gradient.
-template <class F, int C, class Layout, class Samples>
-__device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, int j, float g_color,
-                                            const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
-                                            const Vec2<float> (&positions)[Layout::kCells], Samples& samples,
-                                            Adjoint (&adjoint)[Layout::kCells]) {
-  MovingBlendGrad<float> sums = no_moving_blend_grad<float>();
+/// Takes a group of samples back through the batch that begins with pair k0, and writes the sums of each pair to `sums`
+/// and shared.hits[group]. load(from) brings the samples to before the staged splat `from`. All lanes must call it.
+template <class F, int C, class Layout, bool kTogether, class Shared, class Load>
+__device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int group, typename Shared::Sums& sums,
+                          const TileList& list, int k0, bool with_means, VjpLane<F, C, Layout, kTogether>& lane,
+                          EarlierPositions<Layout>& earlier, Load&& load) {
+  for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
+    uint32_t shown = 0;
+    if (k0 + from < lane.last.warp) {
+      load(from);
+      shown = replay_chunk(shared.stage, from, k0, lane, &earlier);
+    }
+    const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
+    const int own_sum = sum_of_lane<C>();
+    for (uint32_t mask = shown; mask != 0;) {
+      const int n = 31 - __clz(mask), j = int(listed[n]);
+      mask ^= 1u << n;
+      TileSplatRef<F, C> splat = shared.stage.splats[j];
+      const float g_color = lane.grad.times(splat.channels, params, lane.pixel, [&] { return list.splat(k0 + j); });
+      Vec2<float> positions[Layout::kCells];
+      earlier.get(n, positions);
+      MovingBlendGrad<float> of_cells = no_moving_blend_grad<float>();
 #pragma unroll
-  for (int i = 0; i < Layout::kCells; ++i) {
-    const Vec2<float> z = corners.node(splat.terms, i, positions[i]);
-    const float raw = exp2(F::log_alpha(splat.terms, z));
-    const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
-    add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
-                             samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace, sums);
+      for (int i = 0; i < Layout::kCells; ++i) {
+        const auto [z, raw] = lane.corners.see(splat.terms, i, positions[i]);
+        const bool composited = raw >= float(kAlphaMin) && k0 + j < lane.last.samples[i];
+        add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
+                                 lane.samples.transmittance[i], lane.adjoint[i].later, lane.adjoint[i].dL_dposition,
+                                 of_cells);
+      }
+      const auto& [contribution, of_splat] = of_cells;
+      if (with_means)
+        put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums[j] + Shared::kMeans);
+      const PairGrad<float> of_pair = {of_splat.sums, of_splat.weighted};
+      put_warp_sums(of_pair, times(contribution, lane.grad.channels), sums[j] + own_sum);
+    }
+    const uint32_t hits = warp_or(shown >> lane_id() & 1 ? 1u << (listed[lane_id()] - from) : 0u);
+    if (lane_id() == 0) shared.hits[group][from / kStateChunk] = hits;
   }
-  return sums;
 }
 
-/// Takes a warp's samples from after the chunk of 32 pairs that begins at staged splat `from` to before it, and writes
-/// to `sums` the sums of the splats that replay_chunk() has returned, `shown`. `k0`: the pair that is staged first.
-/// Returns which pairs of the chunk have sums. All lanes must call it.
-template <class F, int C, class Layout, class Shared, class Samples>
-__device__ uint32_t chunk_vjp(const BlendVjpParams& params, Shared& shared, float (*sums)[Shared::kSums],
-                              const TileList& list, int k0, int from, uint32_t shown, const Pixel& pixel,
-                              const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
-                              const SampleGrad<F, C>& grad, const EarlierPositions<Layout>& earlier, bool with_means,
-                              Samples& samples, Adjoint (&adjoint)[Layout::kCells]) {
-  const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
-  const int own_sum = sum_of_lane<C>();
-  for (uint32_t mask = shown; mask != 0;) {
-    const int n = 31 - __clz(mask), j = int(listed[n]);
-    mask ^= 1u << n;
-    TileSplatRef<F, C> splat = shared.stage.splats[j];
-    const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-    Vec2<float> positions[Layout::kCells];
-    earlier.get(n, positions);
-    const auto [contribution, of_splat] =
-        walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, positions, samples, adjoint);
-    if (with_means) put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums[j] + Shared::kMeans);
-    const PairGrad<float> of_pair = {of_splat.sums, of_splat.weighted};
-    put_warp_sums(of_pair, times(contribution, grad.channels), sums[j] + own_sum);
+/// What a block of moving_vjp_kernel has in shared memory. Two chunks with one cell of a lane; with more cells one,
+/// which leaves more shared memory for the positions of samples.
+template <class F, int C, class Layout>
+struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, true> {
+  int last[Layout::kWarps];  ///< of SamplesLast
+
+  /// Value v of the sums of all warps for pair j.
+  __device__ float total(int j, int v) const {
+    float sum = 0;
+#pragma unroll
+    for (int w = 0; w < Layout::kWarps; ++w) {
+      if (this->is_hit(w, j)) sum += this->inside[w][j][v];
+    }
+    return sum;
   }
-  return warp_or(shown >> lane_id() & 1 ? 1u << (listed[lane_id()] - from) : 0u);
-}
+};
 
 /// A block per tile whose list is not cut. For the C channels from `first` on; `Layout`: a CellLayout; `in_shared`: of
 /// EarlierPositions, whose shared memory follows Shared.
@@ -180,95 +171,65 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
   wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout>;
-  using Samples = MovingSamples<F, Layout>;
-  constexpr int kCells = Layout::kCells, kBatch = Shared::kBatch;
-  constexpr bool kMany = C > kFewChannels;  // `first` may be above 0, and there may be more channels than C
+  using Lane = VjpLane<F, C, Layout>;
+  using Samples = typename Lane::Samples;
+  constexpr int kBatch = Shared::kBatch;
   static_assert(Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  const int tile = listed_tile(params, params.plan->counts.segments + int(blockIdx.x));
+  const int tile = listed_tile(params, params.plan->counts.segments + int(blockIdx.x)), warp = threadIdx.x / 32;
   if (tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const StatePlaces places(params.lists, list, params.grid, tile);
-  const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
-  const bool with_means = params.mean_sums != MeanSums::kNone;
-  const bool all_at_once = kMany && with_means && channel_count > C;
-  const bool with_shape = !all_at_once || first == 0;
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  const CellCorners<F, Layout> corners(p);
-  Samples samples(pixel.inside);
-
-  const LastSplats<F, Layout> lasts(params.last, pixel, shared.last);
-  const int (&last)[kCells] = lasts.samples;
-  if (first % kChannelGroup == 0 && !list.of_patch) {  // pairs that nothing reached
-    for (int k = lasts.block + threadIdx.x / kClearThreads; k < list.count; k += Layout::kThreads / kClearThreads)
-      clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
-  }
-
-  const SampleGrad<F, C> grad(params, pixel, first);
-  Adjoint adjoint[kCells];
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
-
+  const TileCheckpoints tile_checkpoints(params.lists, list, params.grid, tile);
+  const WantedSums<C> wanted(params, first);
+  Lane lane(params, list);
+  const int stop = lane.last.of_block(shared.last);
+  clear_pairs<Layout::kThreads>(params, list, stop, list.count, first);
+  lane.begin(params, first, wanted);
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
-  const auto replay = [&](int from, int k0, auto keep_in) {  // pair k0 is staged first
-    return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, keep_in);
-  };
-
-  const int stop = lasts.block;
   int k0 = (stop - 1) / kBatch * kBatch;
   int32_t id = shared.stage.splat_of(list, k0, stop);
   for (int k1 = stop; k1 > 0; k1 = k0, k0 -= kBatch) {
-    const int count = k1 - k0;
-    if (places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
-      const int checkpoint = k0 / places.spacing;
-      int k = checkpoint * places.spacing;
-      samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k, last);
+    if (tile_checkpoints.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
+      const int checkpoint = k0 / tile_checkpoints.spacing;
+      int k = checkpoint * tile_checkpoints.spacing;
+      lane.samples.load(params.checkpoints + (tile_checkpoints.first + checkpoint - 1) * Samples::kCheckpoint, k,
+                        lane.last.samples);
       for (; k < k0; k += kBatch) {
         __syncthreads();
-        shared.stage.load(params.splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
+        shared.stage.load(params, first, list, shared.stage.splat_of(list, k, k0));
         __syncthreads();
-        for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k, nullptr);
+        for (int from = 0; from < kBatch; from += kStateChunk) replay_chunk(shared.stage, from, k, lane, nullptr);
       }
     }
     const int32_t next_id = k0 > 0 ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
     __syncthreads();  // all have read what the last batch left
-    shared.load(params.splats, params, first, list, k0, id, with_means);
+    if (threadIdx.x < kBatch) shared.load(int(threadIdx.x), params, first, list, k0, id, wanted.means);
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
-    const Samples at_batch = samples;
-    for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
-      uint32_t shown = 0;
-      if (k0 + from < lasts.warp) {
-        if (places.spacing > kStateChunk) {
-          samples = at_batch;
-          for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0, nullptr);
-        } else {
-          const int64_t number = places.of_chunk_at(k0 + from);
-          samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
-        }
-        shown = replay(from, k0, &earlier);
+    const Samples at_batch = lane.samples;
+    batch_vjp(params, shared, warp, shared.inside[warp], list, k0, wanted.means, lane, earlier, [&](int from) {
+      if (tile_checkpoints.spacing > kStateChunk) {
+        lane.samples = at_batch;
+        for (int ahead = 0; ahead < from; ahead += kStateChunk) replay_chunk(shared.stage, ahead, k0, lane, nullptr);
+      } else {
+        lane.samples.load(tile_checkpoints.at<Samples>(params.checkpoints, k0 + from), k0 + from, lane.last.samples);
       }
-      const uint32_t hits =
-          chunk_vjp<F, C, Layout>(params, shared, shared.sums[warp], list, k0, from, shown, pixel, corners, last, grad,
-                                  earlier, with_means && with_shape, samples, adjoint);
-      if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
-    }
+    });
     __syncthreads();
-    write_pairs<C, Layout::kThreads>(params, first, with_means, with_shape, list, shared.rows, count,
-                                     [&](int j, int v) { return shared.total(j, v); });
+    shared.write(params, first, wanted, list, k1 - k0, [&](int j, int v) { return shared.total(j, v); });
   }
 }
 
-/// Launches moving_vjp_kernel with as much of EarlierPositions in shared memory as leaves room for kMovingVjpBlocks on
-/// a multiprocessor.
-template <class F, int C, class Layout>
-void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
-  constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout>);
-  const int in_shared = EarlierPositions<Layout>::in_shared_of_blocks(kMovingVjpBlocks<C, Layout, false>, kShared);
-  const LaunchShape shape = {blocks, Layout::kThreads, kShared + in_shared * EarlierPositions<Layout>::kBytes};
-  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_shared);
+/// Launches `kernel`, which has Shared in shared memory, and as much of EarlierPositions as leaves room for
+/// kMovingVjpBlocks on a multiprocessor.
+template <class Shared, int C, class Layout, bool kSegments, class Kernel>
+void launch_vjp(Kernel kernel, const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
+  using Earlier = EarlierPositions<Layout>;
+  const size_t all = shared_bytes_of_blocks(kMovingVjpBlocks<C, Layout, kSegments>);
+  const size_t splats = all > sizeof(Shared) ? (all - sizeof(Shared)) / Earlier::kBytes : 0;
+  const int in_shared = int(std::min<size_t>(splats, kMostInShared)) / Earlier::kUnit * Earlier::kUnit;
+  launch(kernel, {blocks, Layout::kThreads, sizeof(Shared) + in_shared * Earlier::kBytes}, stream, p, first, in_shared);
 }
 
 }  // namespace ar::cuda

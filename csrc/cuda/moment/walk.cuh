@@ -10,27 +10,6 @@
 
 namespace ar::cuda {
 
-/// Composites the staged splats in [from, to) that reach the warp's pixels; the first that is staged is pair k0.
-template <class F, int C, class Layout, bool kKeep, class Stage>
-__device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend<F, C, Layout, kKeep>& blend) {
-  constexpr int kCells = Layout::kCells;
-  const int listed = stage.lists.list(stage.reach, from, to);
-  int shown[kCells];  // the entry of the last that was composited into each sample
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) shown[i] = -1;
-  for (int n = 0; n < listed; n += kBetweenVotes) {
-    if (!__any_sync(kAllLanes, blend.samples.open())) break;
-    stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
-      TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
-      blend.add(splat, int(entry), shown);
-    });
-  }
-#pragma unroll
-  for (int i = 0; kKeep && i < kCells; ++i)
-    if (shown[i] >= 0) blend.last[i] = k0 + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
-  __syncwarp();  // all have read the list
-}
-
 template <class Layout, int C>
 inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / Layout::kThreads, 1), Layout::kThreads);
 
@@ -53,27 +32,41 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
   const TileList list = list_of(params.lists, params.grid, tile);
   // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
   if (is_cut && !list.of_patch) return;
-  const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep> blend(p, pixel.inside);
+  const TileCheckpoints tile_checkpoints(params.lists, list, params.grid, tile);
+  MovingBlend<F, C, Layout, kKeep> blend(list, params.grid);
   int32_t id = stage.splat_of(list, 0, list.count);
   for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
     const int count = min(list.count - k, kBatch);
     const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
-    stage.load(params.splats, params.channels, first, list, id);
+    stage.load(params, first, list, id);
     __syncthreads();
     if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kListed) {
       if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;  // no checkpoint is needed
-      if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
-        blend.samples.store(params.checkpoints +
-                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
+      if (kKeep && k + from > 0 && (k + from) % tile_checkpoints.spacing == 0)
+        blend.samples.store(params.checkpoints + (tile_checkpoints.first + (k + from) / tile_checkpoints.spacing - 1) *
+                                                     blend.samples.kCheckpoint);
       if constexpr (kLists) {
-        blend_staged(stage, from, min(count, from + kListed), k, blend);
+        constexpr int kCells = Layout::kCells;
+        const int listed = stage.lists.list(stage.reach, from, min(count, from + kListed));
+        int shown[kCells];  // the entry of the last splat that was composited into each sample
+#pragma unroll
+        for (int i = 0; i < kCells; ++i) shown[i] = -1;
+        for (int n = 0; n < listed; n += kBetweenVotes) {
+          if (!__any_sync(kAllLanes, blend.samples.open())) break;
+          stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
+            TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
+            blend.add(splat, int(entry), shown);
+          });
+        }
+#pragma unroll
+        for (int i = 0; kKeep && i < kCells; ++i)
+          if (shown[i] >= 0) blend.last[i] = k + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
+        __syncwarp();  // all have read the list
       } else {
-        for (uint32_t left = stage.reached(from); left != 0;) {
+        const bool reaches = stage.reach[from + 31 - lane_id()] >> (threadIdx.x / 32) & 1;
+        for (uint32_t left = __ballot_sync(kAllLanes, reaches); left != 0;) {
           const int j = from + take_first(left);
           TileSplatRef<F, C> splat = stage.splats[j];
           blend.add(splat, k + j + 1, blend.last);
@@ -81,7 +74,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
       }
     }
   }
-  blend.write(params, first, pixel);
+  blend.write(params, first);
 }
 
 }  // namespace ar::cuda
