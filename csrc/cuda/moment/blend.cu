@@ -1,4 +1,6 @@
-// Launches the forward kernels of footprints whose samples move. dispatch.cu calls blend_moment().
+// Forward launches for footprints whose samples move; dispatch.cu calls blend_moment(). Where lists are cut into
+// segments (cut_lists.h), filter runs once. Then, for each group of channels, listed_blend takes the lists that are
+// cut, and moving_blend the others.
 #include "cuda/dispatch.h"
 #include "cuda/moment/listed.cuh"
 #include "cuda/moment/walk.cuh"
@@ -6,8 +8,7 @@
 namespace ar::cuda {
 namespace {
 
-/// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are cut is launched first,
-/// because the longest of them may outlast everything else, and the kernel for the other lists begins beside it.
+/// Channels [first, first + C). The kernel for lists that are cut may end last, and is launched first.
 template <class F, int C, int kSide> void launch_group(const BlendParams& p, int first, cudaStream_t stream) {
   using Layout = EvenLayout<F, kSide>;
   const bool keeps = p.transmittance && first == 0;

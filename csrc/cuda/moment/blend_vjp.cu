@@ -1,12 +1,12 @@
-// Launches the backward kernels of footprints whose samples move. dispatch.cu calls blend_vjp_moment() and csrc/torch
-// calls max_group_sums().
+// Backward launches for footprints whose samples move; dispatch.cu calls blend_vjp_moment(). Lists that are cut into
+// segments have the kernels segment_maps, chain_maps and segment_vjp. The others have moving_vjp. csrc/torch asks
+// max_group_sums() for the memory that segment_vjp needs.
 #include "cuda/dispatch.h"
 #include "cuda/moment/vjp_segments.cuh"
 
 namespace ar::cuda {
 namespace {
 
-/// C channels from `first` on, in tiles of kSide x kSide pixels.
 template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, int first, cudaStream_t stream) {
   constexpr int kSegment = moving_segment(F::kSamples, kSide);
   if (p.cut.max_segments > 0) {
@@ -25,7 +25,7 @@ template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, 
                                                           first, stream);
 }
 
-/// The group of channels that begins with `first_of_group`; 0 where they are few.
+/// Up to kChannelGroup channels.
 template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
   if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_group<F, kFewChannels, kSide>(p, 0, stream);
@@ -34,7 +34,7 @@ template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int
     launch_group<F, kMovingChannels, kSide>(p, first, stream);
 }
 
-/// Calls f with the footprint and, as a constant, the side of the tiles.
+/// Calls f(F{}, side) with the side of the tiles as a constant.
 template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
   visit_pixels(footprint, [&](auto chosen) {
     using F = decltype(chosen);
@@ -51,6 +51,7 @@ int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, Tile
     using F = decltype(f);
     constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
     using Layout = ClaimedLayout<F, kSide>;
+    // Three channels may be rows, whose kernels have kFewChannels.
     const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
     numbers = channels > kFewChannels
                   ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)

@@ -1,6 +1,8 @@
-// A library for the kernels of footprints whose samples move (moment/): how the samples, or cells, of a tile are shared
-// out among lanes, the state of a lane's samples and its checkpoints, the splats that a block stages, and compositing a
-// splat into a pixel. It launches nothing.
+// A library for the kernels of moment/; it launches nothing. A pixel of such a footprint F has F::kSamples square
+// cells, each with a sample. A sample is evaluated at its node, which moves in the cell with every splat that is
+// composited. CellLayout says which lane has which samples, MovingSamples is their state, MovingStage a batch of splats
+// in shared memory. MovingBlend composites splats and writes images. Functions that vote, shuffle or wait must be
+// called by all lanes of a warp.
 #pragma once
 
 #include "cuda/moment/cut_lists.h"
@@ -9,64 +11,58 @@
 
 namespace ar::cuda {
 
-/// The group of pixels that the calling warp works on, with a layout whose groups are claimed (kTaken of CellLayout,
-/// vjp_segments.cuh).
-__device__ inline int& taken_group() {
+/// Of the calling warp, with kClaimed.
+__device__ inline int& claimed_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
 }
 
-/// How the samples of a tile of kSide x kSide pixels are shared out. Each lane has kCells cells. The cells of one pixel
-/// are in kLanes neighbouring lanes (a power of two). The pixels of a warp, a group, are a rectangle. The groups of a
-/// tile are spread over kBlocks blocks of kWarps warps; kWarpsOfGroup warps share a group. kTaken: a warp claims one
-/// group after the other, instead of having one.
+/// How the samples of a tile are spread over lanes. kCellsOfLane: neighbouring cells of a row. kLanesOfPixel:
+/// neighbouring lanes, a power of two. The pixels of a warp are a rectangle, called a group. kClaimed: warps claim one
+/// group after another. kWarpsOfGroup: warps with different samples of the same pixels.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
-          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false,
+          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kClaimed = false,
           int kWarpsOfGroup = 1>
 struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
   static constexpr int kSide = kSideOfTile, kTilePixels = kSide * kSide;
   static constexpr int kGroups = kLanes * kTilePixels / 32;
   static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps;
-  static constexpr int kBlocks = kTaken ? 1 : kGroups * kWarpsOfGroup / kWarps;
+  static constexpr int kBlocks = kClaimed ? 1 : kGroups * kWarpsOfGroup / kWarps;
   static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups * kWarpsOfGroup % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
-  static constexpr int kColumns = kSide / kWide;  ///< groups side by side
+  static constexpr int kColumns = kSide / kWide;
 
-  /// This warp's group.
   __device__ static int group() {
-    if constexpr (kTaken) return taken_group();
+    if constexpr (kClaimed) return claimed_group();
     return (int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32) / kWarpsOfGroup;
   }
-  /// The number of the group's pixel i in the tile, row by row, whatever the layout.
+  /// Number of the group's pixel i in the tile, row by row.
   __device__ static int pixel_number(int i) {
     const int g = group();
     return (g / kColumns * kHigh + i / kWide) * kSide + g % kColumns * kWide + i % kWide;
   }
-  __device__ static int pixel_number() { return pixel_number(lane_id() / kLanes); }  ///< of this thread's pixel
-  /// This thread's pixel, relative to the tile's first.
+  __device__ static int pixel_number() { return pixel_number(lane_id() / kLanes); }
+  /// Of this lane, relative to the tile's first.
   __device__ static Vec2<float> pixel() {
     const int g = group(), i = lane_id() / kLanes;
     return {float(g % kColumns * kWide + i % kWide), float(g / kColumns * kHigh + i / kWide)};
   }
-  /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
-  /// Whether this lane writes its samples: AheadLayout has the same sample in several lanes.
+  /// Whether this lane writes its samples, which others may have too (AheadLayout).
   __device__ static bool owns() { return true; }
 
-  /// Bit w: the splat reaches the pixels of warp w of this block (of group w with kTaken), or passes them closely. The
-  /// tile begins at (x0, y0).
+  /// Bit w: the splat reaches the pixels of warp w of this block (kClaimed: of group w), or passes closely.
   template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
     constexpr int kOfBlock = kGroups / kBlocks;
     static_assert(kOfBlock % kColumns == 0);
-    const int rows = kTaken ? 0 : int(blockIdx.x) % kBlocks * kOfBlock / kColumns;  // of the blocks before
+    const int rows = kClaimed ? 0 : int(blockIdx.x) % kBlocks * kOfBlock / kColumns;
     return reached_boxes<kWide, kHigh, kColumns, kOfBlock / kColumns, F>(splat, x0, y0 + rows * kHigh);
   }
-  /// The bit of block_reach() of this warp's pixels.
-  __device__ static int own_bit() { return kTaken ? group() : int(threadIdx.x) / 32; }
+  __device__ static int own_bit() { return kClaimed ? group() : int(threadIdx.x) / 32; }
 
-  /// The sum over the lanes of a pixel, in each of them.
+  /// Over the lanes of a pixel, in each of them.
   __device__ static float sum_lanes(float x) {
 #pragma unroll
     for (int offset = 1; offset < kLanes; offset *= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
@@ -74,19 +70,17 @@ struct CellLayout {
   }
 };
 
-/// How samples are shared out in tiles of kSide x kSide pixels for lists that are not cut, so that there is least to
-/// do, forward and backward. Where cuts_all_lists(), such lists are only those of frames with more pairs than room.
+/// For lists that are not cut: the layout with the least work.
 template <class F, int kSide>
 using EvenLayout =
     std::conditional_t<(kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>, CellLayout<F::kSide, F::kSide, kSide>>;
 
-/// Where the checkpoints of a tile's samples are: the checkpoint before pair i spacing, i > 0, has number first + i
-/// - 1. The tiles of a patch share the room of its list equally.
-struct StatePlaces {
+/// Checkpoint first + i - 1 of a tile is before pair i * spacing, i > 0. Tiles of a patch share the room of its list.
+struct TileCheckpoints {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
 
-  __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
+  __device__ TileCheckpoints(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
       : first(lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
     if (!list.of_patch) return;
     const TileInPatch of_patch(lists, grid, tile);
@@ -94,28 +88,28 @@ struct StatePlaces {
     first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
-  /// The checkpoint before pair k, where each chunk of kStateChunk pairs but the first has one.
+  /// The checkpoint before pair k, if `spacing` is kStateChunk.
   template <class Samples> __device__ float* at(float* checkpoints, int k) const {
     return checkpoints + (first + k / kStateChunk - 1) * Samples::kCheckpoint;
   }
 };
 
-/// The terms of a splat for the cells of a tile: lengths are in edges of cells.
+/// The unit of length is the edge of a cell.
 template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, const TileList& list) {
   auto terms = tile_terms(splat, list);
   terms.w = 1.0f / F::kSide * terms.w;
   return terms;
 }
 
-/// Whether the samples of a pixel are neighbours in a checkpoint of a list that is not cut.
+/// MovingSamples::kTogether for lists that are not cut.
 template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide < kMovingTile;
 
-/// The state of a lane's samples on their way through a list. `kTogether`: in a checkpoint the samples of a pixel are
-/// neighbours, as among the lanes of warps with few pixels; else the pixels of a sample are.
+/// The samples of a lane. A checkpoint has the transmittance and position of each sample of the tile. With kTogether it
+/// is [3, kTilePixels, samples], which suits warps with few pixels, else [samples, 3, kTilePixels].
 template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
-  Vec2<float> position[kCells];  ///< position of the node in its cell
+  Vec2<float> position[kCells];  ///< of the node, in [0, 1]^2
 
   /// Before all splats.
   __device__ explicit MovingSamples(bool inside) {
@@ -133,15 +127,14 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
     return any;
   }
 
-  static constexpr int kCheckpoint = state_planes(F::kSamples) * Layout::kTilePixels;  ///< numbers of a checkpoint
-  static constexpr int kPlane =
-      kTogether ? F::kSamples * Layout::kTilePixels : Layout::kTilePixels;  ///< from a plane to the next
-  /// The index in a checkpoint of the transmittance of sample i of this pixel; its position is in the next two planes.
+  static constexpr int kCheckpoint = state_planes(F::kSamples) * Layout::kTilePixels;
+  static constexpr int kPlane = kTogether ? F::kSamples * Layout::kTilePixels : Layout::kTilePixels;
+  /// Of the transmittance of sample i; its position is in the next two planes.
   __device__ static int in_checkpoint(int i) {
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
-  /// With `last` only the samples that load() reads from a checkpoint before pair k.
+  /// With `last`, only what load() would read before pair k.
   __device__ void store(float* checkpoint, int k = 0, const int* last = nullptr) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -152,8 +145,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
       to[2 * kPlane] = position[i].y;
     }
   }
-  /// The state before pair k, which `checkpoint` has unless k is 0. Samples that have composited their last splat
-  /// before (last[i] <= k) may have no checkpoint there, and need none.
+  /// The state before pair k. A sample with last[i] <= k needs none, and may have no checkpoint.
   __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -167,19 +159,18 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   }
 };
 
-/// A splat at a node: whitened coordinates, and opacity * weight there.
+/// A splat at a node. All kernels call see(), so that alpha always has the same bits.
 struct Seen {
   Vec2<float> z;
   float raw;
 };
 
-/// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. The rounding of whitened
-/// coordinates does not depend on the layout, so that a backward kernel finds what a forward kernel has composited.
+/// Corners of a lane's cells, in edges of cells from the centre of the tile's first pixel. They round alike in every
+/// layout.
 template <class F, class Layout> struct CellCorners {
   static_assert(F::kSide % Layout::kCells == 0, "the cells of a lane are in one row");
   float left[Layout::kCells], top;
 
-  /// `p`: the pixel, relative to the tile's first.
   __device__ explicit CellCorners(Vec2<float> p) {
     const Vec2<float> corner = {F::kSide * (p.x - 0.5f), F::kSide * (p.y - 0.5f)};
 #pragma unroll
@@ -187,7 +178,7 @@ template <class F, class Layout> struct CellCorners {
     top = corner.y + float(Layout::first_sample() / F::kSide);
   }
 
-  /// The splat at the node of cell i, at `position` in the cell.
+  /// At `position` in cell i.
   template <class Terms> __device__ Seen see(const Terms& terms, int i, Vec2<float> position) const {
     const Vec2<float> at = {left[i] + position.x, position.y};
     const Vec2<float> z = F::whitened_node(terms, F::whitened_row(terms, top), at);
@@ -197,8 +188,8 @@ template <class F, class Layout> struct CellCorners {
 
 template <class Layout> inline constexpr int kListAhead = list_ahead(Layout::kCells);
 
-/// Up to kBatch splats of a tile, with C channels, that a block works on together, and for each warp a list of up to
-/// kListed of them that reach its pixels. `kOffsets`: entries of lists are offsets in memory, else numbers of splats.
+/// A batch of kBatch splats, and for each warp a list of up to kListed of them that reach its pixels. kOffsets: entries
+/// are offsets in memory, not indices.
 template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffsets = false> struct MovingStage {
   static_assert(kBatch % 32 == 0);
   using Lists =
@@ -207,17 +198,16 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
   uint32_t reach[kBatch];
   Lists lists;
 
-  /// This thread's splat of those in [k, k + kBatch) and before `end` of the list, or -1.
+  /// This thread's splat of [k, k + kBatch), or -1 from pair `end` on.
   __device__ static int32_t splat_of(const TileList& list, int k, int end) {
     static_assert(kBatch <= Layout::kThreads);
     const int t = threadIdx.x;
     return t < kBatch && k + t < end ? list.splat(k + t) : -1;
   }
-  /// Loads the splats, `id` = splat_of(), with channels from `first` on.
   template <class Params> __device__ void load(const Params& params, int first, const TileList& list, int32_t id) {
     if (threadIdx.x < kBatch) load_one(int(threadIdx.x), params, first, list, id);
   }
-  /// Loads splat `id` at index t, or none if it is -1.
+  /// Splat `id`, or none if it is -1.
   template <class Params>
   __device__ void load_one(int t, const Params& params, int first, const TileList& list, int32_t id) {
     uint32_t bits = 0;
@@ -230,12 +220,11 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
   }
 };
 
-/// A lane's share of blending a pixel with C channels. kKeep: for a backward pass it also finds `last`.
+/// A lane's share of a pixel. kKeep: for a backward pass.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
-  /// Whether the warp votes on whether any of its samples shows a splat before it composites the splat. That pays where
-  /// a lane has several cells and a warp so few pixels that often none shows it, but not with kKeep, which takes more
-  /// registers.
+  /// Whether the warp first votes if any sample shows the splat. It pays with several cells in a lane and few pixels in
+  /// a warp; kKeep needs the registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   Pixel pixel;
   MovingSamples<F, Layout, kTogether> samples;
@@ -246,8 +235,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
   __device__ MovingBlend(const TileList& list, TileGrid grid)
       : pixel(list, grid, Layout::pixel()), samples(pixel.inside), corners(Layout::pixel()) {}
 
-  /// Composites a splat into the samples; with kKeep shown[i] becomes `index` where it was composited into sample i.
-  /// With kVotes all lanes must call it.
+  /// With kKeep shown[i] becomes `index` if sample i shows the splat. With kVotes all lanes must call it.
   __device__ void add(TileSplatRef<F, C>& splat, int index, int (&shown)[kCells]) {
     const auto see = [&](int i) { return corners.see(splat.terms, i, samples.position[i]); };
     [[maybe_unused]] Seen seen[kCells] = {};
@@ -269,7 +257,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     });
   }
 
-  /// Adds the lanes of each pixel up and writes its images. All lanes must call it.
+  /// Writes image and alpha of the pixel and, with kKeep, transmittance and `last`.
   __device__ void write(const BlendParams& params, int first) {
     float through = 0;
 #pragma unroll

@@ -1,7 +1,6 @@
-// For footprints whose samples move: which lists are cut into segments that are worked on side by side, and how a
-// kernel finds its segment. moving_list_cut() is the rule; route_of() (dispatch.h) calls it on the host, once for a
-// pass, and plan_chunks (plan.cuh) applies it and writes the segments into the chunk plan. ListSegment reads one of
-// them there.
+// Which lists of footprints whose samples move are cut into segments, which are worked on side by side. The rule is
+// moving_list_cut(). On the host, route_of() (dispatch.h) calls it. On the device, plan_chunks (plan.cuh) writes the
+// segments into the chunk plan, where kernels read them as ListSegment.
 #pragma once
 
 #include <algorithm>
@@ -10,11 +9,11 @@
 
 namespace ar::cuda {
 
-/// A segment of a list that is cut.
+/// Of a list that is cut.
 struct ListSegment {
-  int number;  ///< among all segments; the segments of a list are adjacent
+  int number;  ///< among all segments
   int tile;    ///< -1: there is no segment of that number
-  int index;   ///< in its list: it has pairs [index length, (index + 1) length)
+  int index;   ///< in its list, from pair index * length on
 
   AR_HD ListSegment(const PlanState& plan, const TileChunk* chunk_order, int number)
       : number(number), tile(-1), index(0) {
@@ -22,19 +21,17 @@ struct ListSegment {
     tile = chunk_order[number].tile;
     index = chunk_order[number].chunk;
   }
-  /// The number of the first segment of its list.
+  /// Number of the first segment of its list.
   AR_HD int first() const { return number - index; }
 };
 
 /// Pairs of a segment where `samples` samples move, in tiles of side x side pixels.
 AR_HD constexpr int moving_segment(int samples, int side) { return segment_length(samples, side < kMovingTile); }
 
-/// Whether all lists are cut: in small images, whose few tiles have long lists, so that the time is that of the
-/// longest. Not with tiles of 4x4 pixels, of which there are four times as many, with shorter lists.
+/// In small images the longest list sets the time. Tiles of 4x4 pixels are many, with short lists.
 inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
 
-/// How lists are cut, where there is room for `capacity` pairs. In large images only lists are cut that a block would
-/// still walk when all others have ended.
+/// `capacity`: pairs that there is room for. In large images lists are cut whose blocks would outlast all others.
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid, int multiprocessors) {
   const int length = moving_segment(samples, grid.side()), tiles = int(grid.tiles());
   const int64_t segments = capacity / length;

@@ -1,11 +1,11 @@
-// Kernels filter and listed_blend: the forward pass of footprints whose samples move, for lists that are cut
-// (cut_lists.h). blend_moment (blend.cu) launches them before moving_blend.
+// Kernels filter and listed_blend: the forward pass of moment/ for lists that are cut into segments. blend_moment
+// (blend.cu) launches them. `filter` tests every pair of these lists against every pixel of its tile, and writes the
+// bits to reach_words. `listed_blend` reads the bits, lists and splats, and writes what moving_blend writes for other
+// lists.
 //
-// In a small image of a large scene a tile may have hundreds of thousands of splats, most of them smaller than a pixel.
-// The time is that of the longest sequence of splats that some sample meets. So filter_kernel first tests all pairs of
-// a list side by side, and writes a bit for each pair and pixel (reach_words). Then listed_blend_kernel has a warp for
-// a few neighbouring pixels: either each pixel takes its own splats from a queue (queue.cuh), or the warp walks the
-// splats that reach any of its pixels, and each lane composites only the ones of its own pixel.
+// In a small image of a large scene, a tile may have hundreds of thousands of splats, most of them smaller than a
+// pixel. So a pixel composites only splats that reach it. It has a queue of them (queue.cuh), or its warp walks the
+// splats that reach any of a few pixels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -14,18 +14,17 @@
 namespace ar::cuda {
 
 inline constexpr int kFilterWords = kFilterPiece / 32;
-/// Pairs whose bits a warp reads at once: a word for each lane.
+/// Pairs whose bits a warp reads at once.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// Bit x: the span holds pixel x0 + x of a row of kSide pixels. The differences are exact wherever they decide.
+/// Bit x: the span holds pixel x0 + x. The differences are exact wherever they decide.
 template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float x0) {
   const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kSide))));
   const int end = int(std::floor(min(max(span.hi - x0, -1.0f), float(kSide - 1)))) + 1;
   return ((1u << end) - 1) & ~((1u << first) - 1);
 }
 
-/// The bits of a warp with lanes and bits exchanged: bit b of lane l becomes bit l of lane b. In step s lanes whose
-/// numbers differ by s trade the bits whose numbers do.
+/// Bit b of lane l becomes bit l of lane b. In step s, lanes whose numbers differ by s exchange bits whose numbers do.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
 #pragma unroll
   for (int s = 16; s > 0; s /= 2) {
@@ -37,9 +36,10 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
   return bits;
 }
 
-/// A thread per pair of a list that is cut: writes to reach_words which pixels of the tile its splat reaches.
+/// A block tests kFilterPiece pairs of a segment at a time, a thread each, and writes reach_words as pixel_words()
+/// says.
 template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
-  wait_for_earlier_kernels();  // first: moving_blend_kernel, which does not wait, reads the plan
+  wait_for_earlier_kernels();  // first: moving_blend_kernel reads the plan
   let_next_kernel_begin();
   constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide, kWords = (kPixels + 31) / 32;
   constexpr int kPieces = moving_segment(F::kSamples, kSide) / kFilterPiece;  // of a segment
@@ -49,7 +49,7 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
     const ListSegment segment(plan, params.plan.chunk_order, number / kPieces);
     const TileList list = list_of(params.lists, params.grid, segment.tile);
     const int piece = segment.index * kPieces + number % kPieces, k = piece * kFilterPiece + int(threadIdx.x);
-    uint32_t reach[kWords] = {};  // a bit per pixel
+    uint32_t reach[kWords] = {};
     if (k < list.count) {
       const Support<float> support = support_of(load_splat<F>(params.splats, list.splat(k)));
 #pragma unroll
@@ -59,7 +59,7 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
                                     << row % kRowsOfWord * kSide;
       }
     }
-    __syncthreads();  // all have read the words of the last piece
+    __syncthreads();  // all have read the last words
 #pragma unroll
     for (int w = 0; w < kWords; ++w) {
       const uint32_t of_pixel = transpose_bits(reach[w]);
@@ -74,21 +74,20 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
   }
 }
 
-/// The splats that a warp of up to kMostPixels pixels is about to composite, in shared memory.
+/// For a warp of up to kMostPixels pixels.
 template <class F, int C, int kMostPixels> struct ListedStage {
   TileSplat<F, C> splats[32];
   int32_t ids[kListedBatch];
-  uint16_t numbers[kListedBatch];   ///< of the pairs in the batch
-  uint32_t words[kMostPixels][32];  ///< the batch's bits of each pixel
+  uint16_t numbers[kListedBatch];  ///< in the batch
+  uint32_t words[kMostPixels][32];
 
-  /// Lists the pairs of a batch that reach any pixel, from `words`, and returns their number. The batch begins at pair
-  /// k. All lanes must call it.
+  /// Collects the pairs of the batch from pair k on that reach any pixel, and returns their number.
   template <class Layout> __device__ int collect(const float* splats_in, const TileList& list, int k) {
     const int lane = lane_id();
     uint32_t word = 0;
 #pragma unroll
     for (int i = 0; i < Layout::kPixels; ++i) word |= words[i][lane];
-    const int count = __popc(word), up_to = warp_inclusive_sum(count);  // of the words up to this lane's
+    const int count = __popc(word), up_to = warp_inclusive_sum(count);
     int to = up_to - count;
     for (; word != 0; word &= word - 1) numbers[to++] = uint16_t(32 * lane + __ffs(word) - 1);
     const int all = __shfl_sync(kAllLanes, up_to, 31);
@@ -102,8 +101,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
     return all;
   }
 
-  /// Which of the collected pairs in [from, from + 32), `count` in all, reach this lane's pixel, in the order of
-  /// take_first. All lanes must call it.
+  /// Which of the `count` pairs, from `from` on, reach this lane's pixel, in the order of take_first.
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
     const int lane = 31 - lane_id(), number = from + lane < count ? numbers[from + lane] : 0;
     uint32_t mine = 0;
@@ -117,17 +115,16 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
-/// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels
-/// from `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
+/// A warp walks the splats that reach any of its pixels. Parameters as of blend_queued.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
   const int lane = lane_id();
-  const StatePlaces places(params.lists, list, params.grid, cut.tile);
+  const TileCheckpoints stored(params.lists, list, params.grid, cut.tile);
   MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
-  uint32_t words[kPixels];              // of each pixel, this lane's of a batch
-  const auto read_words = [&](int k) {  // of the batch that begins at k
+  uint32_t words[kPixels];
+  const auto read_words = [&](int k) {
     const int mine = k + 32 * lane;
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
@@ -136,19 +133,19 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
-  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + stored.first * blend.samples.kCheckpoint};
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
-      constexpr uint32_t kFirst = kAllLanes >> (32 - Layout::kLanes);  // lanes of the first pixel
+      constexpr uint32_t kFirst = kAllLanes >> (32 - Layout::kLanes);
       stage.words[i][lane] = open & kFirst << (i * Layout::kLanes) ? words[i] : 0u;
     }
-    read_words(k0 + kListedBatch);  // so that the next batch need not wait for memory
+    read_words(k0 + kListedBatch);
     const int count = stage.template collect<Layout>(params.splats, list, k0);
     for (int from = 0; from < count && open; from += 32) {
-      __syncwarp();  // all have read the splats before
+      __syncwarp();  // all have read the last splats
       if (from + lane < count) {
         const int32_t id = stage.ids[from + lane];
         const Splat<F, float> splat = load_splat<F>(params.splats, id);
@@ -157,7 +154,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
       uint32_t left = stage.template reached<Layout>(from, count);
       if (!blend.samples.open()) left = 0;
       __syncwarp();
-      // Each step waits for the one before. The next splat, which need not, is read meanwhile.
+      // Each step waits for the step before it; meanwhile the next splat is read.
       int j = __clz(int(left)) % 32;
       TileSplat<F, C> splat = stage.splats[j];
       int k = k0 + stage.numbers[from + j];
@@ -180,22 +177,23 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
 
 template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
 
-/// How the pixels of a tile are shared out among warps. The quickest of these layouts was found by measurement
-/// (docs/performance-log.md, "`moment`: a queue for each pixel" and "`moment`: small tiles, and pixels of four warps").
+/// How pixels are spread over warps, as measured: docs/performance-log.md, "`moment`: a queue for each pixel" and
+/// "`moment`: small tiles, and pixels of four warps".
 template <class F, int kSide> struct ListedLayouts {
   static constexpr int kWarps = kListedWarps<F>;
   using Longest = AheadLayout<F, kSide, 1, kWarps>;
-  /// Other lists: with one sample they have queues too, with four they are walked, with more there are none.
+  /// For lists that are not among the longest: queues with one sample, walks with four. With more samples there are no
+  /// such lists.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = CellLayout<1, 16, kSide, kWarps>;  ///< from kLongList pairs on
   using Short = CellLayout<1, kWalked ? 4 : 16, kSide, kWarps>;
-  /// Blocks of a list. The first blocks of a short list have its pixels.
+  /// Of a list; a short list needs fewer.
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
-  /// Blocks to launch: a multiple of the blocks of one of the longest lists, so that a block has the same pixels in
-  /// every tile that it goes on to. In small images moving_blend has little to do, and they need not leave it any room.
+  /// A multiple of kOfLongest: a block has the same pixels in each of its tiles. In small images moving_blend has
+  /// little to do.
   static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
     const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
     const int64_t wanted =
@@ -205,18 +203,17 @@ template <class F, int kSide> struct ListedLayouts {
   }
 };
 
-/// The splats that a warp is about to composite, in shared memory.
 template <class F, int C, int kSide> union WarpStage {
   using Layouts = ListedLayouts<F, kSide>;
   QueuedStage<F, C> queued;
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
-/// A warp per few pixels of a tile whose list is cut, or a block per pixel of the longest lists, which come first.
-/// Blends the C channels from `first` on. `kKeep`: stores checkpoints and `last`; `kSegment`: pairs of a segment.
+/// A block has a pixel of one of the longest lists, which come first, or each of its warps a few pixels of another
+/// list. Writes the channels [first, first + C). kKeep: for a backward pass. kSegment: pairs of a segment.
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
-  let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
+  let_next_kernel_begin();  // moving_blend_kernel need not wait for filter_kernel
   wait_for_earlier_kernels();
   using Layouts = ListedLayouts<F, kSide>;
   __shared__ WarpStage<F, C, kSide> stages[Layouts::kWarps];

@@ -1,38 +1,36 @@
-// A library for listed_blend_kernel (listed.cuh): pixels that look ahead in their lists, for footprints whose samples
-// move. Each pixel of a warp has a queue of the splats that reach it, filled from the bits that filter_kernel wrote,
-// and does not wait for splats that reach only its neighbours. Several lanes have the same sample: each tests another
-// splat, and the first splat that shows is composited. In the longest lists the warps of a block share the samples of
-// one pixel.
+// A library for listed_blend_kernel (listed.cuh): pixels with queues. A pixel has a queue of the splats that reach it,
+// filled from the bits of filter_kernel. It does not wait for splats that reach only its neighbours. Several lanes have
+// the same sample, and test several splats at once. For the longest lists all warps of a block have one pixel.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
-/// A warp has kPixelsOfWarp pixels; or the kWarpsOfPixel warps of a block have one pixel, each warp other samples of
-/// it. A sample has kAhead neighbouring lanes.
+/// A warp has kPixelsOfWarp pixels, or kWarpsOfPixel warps have different samples of one pixel. kAhead neighbouring
+/// lanes have the same sample.
 template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
 struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
-  /// Samples that a warp has of a pixel, and lanes of a sample.
+  /// Samples of a pixel in a warp.
   static constexpr int kOfWarp = F::kSamples / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
   static_assert(kOfWarp * kWarpsOfPixel == F::kSamples && kOfWarp * kAhead == Base::kLanes);
   static_assert(kWarpsOfPixel == 1 || kPixelsOfWarp == 1);
   __device__ static int first_sample() {
     return int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + lane_id() % Base::kLanes / kAhead;
   }
-  /// This lane's number among the lanes of its sample.
+  /// Of this lane, among sharers().
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
-  /// The lanes of this lane's sample, and the first of them.
+  /// Lanes with the same sample.
   __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
   __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
-  /// The sum over the lanes of a pixel, in each of them. All threads must call it.
+  /// Over the lanes of a pixel. All threads must call it.
   __device__ static float sum_lanes(float x) {
     x = Base::sum_lanes(x);
     if constexpr (kWarpsOfPixel > 1) {
       __shared__ float of_warp[kWarpsOfPixel];
-      __syncthreads();  // all have read the last sum
+      __syncthreads();
       if (lane_id() == 0) of_warp[threadIdx.x / 32] = x;
       __syncthreads();
       x = of_warp[0];
@@ -41,7 +39,7 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
     }
     return x;
   }
-  /// The largest x of these lanes. All lanes must call it.
+  /// Over sharers().
   __device__ static int max_of_sharers(int x) {
 #pragma unroll
     for (int offset = 1; offset < kAhead; offset *= 2)
@@ -50,22 +48,21 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   }
 };
 
-/// The index in reach_words of the bits of a pixel, in tiles of kSide x kSide pixels. The bit of pair k is bit k % 32
-/// of the pixel's word k / 32. `first`: number of the first segment of the tile's list.
+/// Index in reach_words of the words of a pixel: bit k % 32 of word k / 32 is of pair k. `first`: the list's first
+/// segment.
 template <class F, int kSide> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
   constexpr int kPixels = kSide * kSide, kSegment = moving_segment(F::kSamples, kSide);
   const int segments = (list.count + kSegment - 1) / kSegment;
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
-/// The checkpoints of a lane's samples that are still to be stored, for a list that is cut into segments of kSegment
-/// pairs: one before each segment, and all within the first. segment_maps_kernel stores the checkpoints within the
-/// other segments, side by side; here every sample would wait for them.
+/// Checkpoints that are still to be stored for a list in segments of kSegment pairs: all in the first segment, and one
+/// before each other. The remaining ones are stored side by side by segment_maps_kernel.
 template <int kSegment> struct CheckpointsAhead {
-  int pair;   ///< the next checkpoint is before this pair
-  float* to;  ///< its address
+  int pair;  ///< after the next checkpoint
+  float* to;
 
-  /// Stores `samples` in the checkpoints up to pair k.
+  /// Stores the checkpoints before pairs up to k.
   template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
 #pragma unroll 1
     while (pair <= k) {
@@ -77,41 +74,40 @@ template <int kSegment> struct CheckpointsAhead {
   }
 };
 
-/// For each pixel of a warp a queue of the pairs that reach it, front to back, filled from the bits of filter_kernel.
+/// For each pixel of a warp the pairs that reach it, in the order of the list.
 template <class Layout> struct PairQueues {
-  using Bits = uint16_t;                                  ///< what a lane reads at a time
-  static constexpr int kBits = 16;                        ///< for adjacent pairs
-  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs whose bits a pixel's lanes read at a time
+  using Bits = uint16_t;
+  static constexpr int kBits = 16;                        ///< that a lane reads at once
+  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< by the lanes of a pixel
   static constexpr uint32_t kRoom = 2 * kAtOnce;
   using Memory = int32_t[Layout::kPixels][kRoom];
   static_assert(sizeof(Memory) == kQueued * sizeof(int32_t));
 
-  int32_t* pairs;               ///< of this lane's pixel
-  const Bits* words;            ///< of this lane, from the next word on
-  int lane;                     ///< number of this lane among the lanes of the pixel
-  int count;                    ///< pairs of the list; 0 when no more are wanted
-  int next = 0;                 ///< first pair whose bit has not been read
-  uint32_t begin = 0, end = 0;  ///< of the pairs in the queue, counted from the first that was ever in it
-  uint32_t bits;                ///< of this lane, the next to enter the queue
+  int32_t* pairs;  ///< [kRoom] of the pixel
+  const Bits* words;
+  int lane;                     ///< of the pixel
+  int count;                    ///< of the list
+  int next = 0;                 ///< pair whose bit is read next
+  uint32_t begin = 0, end = 0;  ///< of the queue, modulo kRoom
+  uint32_t bits;                ///< read, not queued
 
-  /// `reach_words`: of the pixel. All lanes must call it.
+  /// `reach_words`: of this lane's pixel.
   __device__ PairQueues(Memory& memory, const uint32_t* reach_words, int count)
       : pairs(memory[lane_id() / Layout::kLanes]), lane(lane_id() % Layout::kLanes), count(count) {
     words = reinterpret_cast<const Bits*>(reach_words) + lane;
     bits = has_bits() ? words[0] : 0u;
     fill();
   }
-  /// Whether any of the pairs from `next` on are this lane's.
   __device__ bool has_bits() const { return next + kBits * lane < count; }
-  /// Reads bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
+  /// Reads bits until more than kAtOnce pairs are queued, or the list ends.
   __device__ void fill() {
-    __syncwarp();  // all have read what they took
+    __syncwarp();
     const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
     for (bool wants; __any_sync(kAllLanes, wants = wanted());) {
       uint32_t mine = wants ? bits : 0;
       const int before = next + kBits * lane - 1;
       const int found = __popc(mine);
-      int up_to = found;  // pairs of the pixel's lanes up to this one
+      int up_to = found;
 #pragma unroll
       for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
         const int of_lanes_before = shuffle_up(up_to, offset);
@@ -120,7 +116,7 @@ template <class Layout> struct PairQueues {
       uint32_t to = end + uint32_t(up_to - found);
       for (; mine != 0; mine &= mine - 1) pairs[to++ % kRoom] = before + __ffs(int(mine));
       end += uint32_t(shuffle(up_to, lane_id() | (Layout::kLanes - 1)));
-      // The next bits are read straight into their register, so that nothing waits for them before they are used.
+      // Straight into their register: nothing waits for them yet.
       next += wants ? kAtOnce : 0;
       bits = wants ? 0 : bits;
       if (wants && has_bits()) bits = words[next / kBits];
@@ -129,50 +125,48 @@ template <class Layout> struct PairQueues {
   }
 };
 
-/// The splats that each pixel of a warp is about to composite, and the queues that they come from, in shared memory.
 template <class F, int C> struct QueuedStage {
   TileSplat<F, C> splats[32];
   int32_t pairs[32];
   int32_t queues[kQueued];
 };
 
-/// The next splats of the pixel of this lane on their way from memory into QueuedStage. The lane has one of them.
+/// The next splats of a pixel, one in each lane, on their way from memory to QueuedStage.
 template <class F, int C, class Layout> struct QueuedSplats {
   const float* splats_in;
   const Channels<float>& channels_in;
   const TileList& list;
   int first_channel;
-  int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and the ones after them
+  int n = 0, next_n = 0;  ///< splats of the pixel: read, claimed
   int pair, next_pair;
-  int32_t next_id = 0;  ///< of any splat, where there is no next one
+  int32_t next_id = 0;  ///< of any splat, if none is next
   Splat<F, float> splat;
   Values<C> channels;
 
   __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
       : splats_in(params.splats), channels_in(params.channels), list(list), first_channel(first_channel) {}
 
-  /// Reads the splats that were next, and takes the pairs after them from the queue.
+  /// Reads the splats of the claimed pairs, and claims the next.
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
-    // By all lanes, and so straight into the registers: the compiler would wait to copy what only some lanes read.
+    // By all lanes, straight into the registers: the compiler would wait to copy what only some lanes read.
     splat = load_splat<F>(splats_in, next_id);
     channels = channels_of<C>(channels_in, splat, next_id, first_channel);
     take_next(queues);
   }
   template <class Queues> __device__ void take_next(Queues& queues) {
-    next_n = min(int(queues.end - queues.begin), Layout::kLanes);  // one for each lane of the pixel
+    next_n = min(int(queues.end - queues.begin), Layout::kLanes);
     if (queues.lane < next_n) {
       next_pair = queues.pairs[(queues.begin + uint32_t(queues.lane)) % Queues::kRoom];
       next_id = list.splat(next_pair);
     }
     queues.begin += uint32_t(next_n);
   }
-  /// Puts the splat that was read into the stage. `light`: the transmittance after the steps before.
+  /// `light`: the transmittance after the steps before.
   ///
-  /// The comparison is never true, since a listed splat has a level above 0 and no negative x_given_y. It keeps the
-  /// registers of these two numbers in use: the compiler would else use them for something else, and wait for that
-  /// until the splat has arrived. `light` keeps the compiler from comparing, and waiting, before the steps.
+  /// The comparison is never true: a listed splat has a level above 0, and x_given_y is not negative. It keeps these
+  /// registers in use until the splat arrives. `light` makes the compiler compare after the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
     if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
@@ -180,27 +174,27 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
 };
 
-/// Composites the staged splats of each pixel, n of this lane's pixel from first_staged on. Most splats that reach a
-/// pixel are small and do not show in a sample: the lanes of a sample test kAhead splats at once, composite the first
-/// that shows, and test the later ones again, since the node has moved. All lanes must call it.
+/// Composites the staged splats, n of this lane's pixel from first_staged on. Most splats that reach a pixel show in no
+/// sample. So the lanes of a sample test kAhead splats at once and composite the first that shows. They test the later
+/// ones again, since the node has moved.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
-  constexpr bool kOnce = kAhead == Layout::kLanes;  // a sample has a lane for each of the staged splats
+  constexpr bool kOnce = kAhead == Layout::kLanes;  // a lane for each staged splat
   const int own = lane_id(), first_lane = Layout::first_sharer();
   float& transmittance = blend.samples.transmittance[0];
   Vec2<float>& position = blend.samples.position[0];
-  int taken = first_staged + Layout::ahead();  // the splat of this lane, if there is one
-  int left = n;                                // splats from the one of the sample's first lane on
-  auto splat = stage.splats[taken];
-  int pair = stage.pairs[taken];
-  // Lanes of the sample with a splat that may still be composited.
+  int own_splat = first_staged + Layout::ahead();  // the splat of this lane
+  int left = n;                                    // splats from that of first_lane on
+  auto splat = stage.splats[own_splat];
+  int pair = stage.pairs[own_splat];
+  // Lanes of the sample with a splat that may show.
   const auto lanes_with_splats = [&] {
     const int count = min(left, kAhead);
     return transmittance > 0 && count > 0 ? kAllLanes >> (32 - count) << first_lane : 0u;
   };
   uint32_t live = lanes_with_splats();
-  // Lanes with a pair before which a checkpoint is to be stored.
+  // Lanes whose pair has an earlier checkpoint to store.
   const auto lanes_at_checkpoint = [&] { return kKeep ? __ballot_sync(kAllLanes, pair >= checkpoints.pair) : 0u; };
   uint32_t at_checkpoint = lanes_at_checkpoint();
   while (true) {
@@ -208,7 +202,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     const bool hit = (live >> own & 1) != 0 && raw >= float(kAlphaMin);
     const uint32_t all_hits = __ballot_sync(kAllLanes, hit), hits = all_hits & Layout::sharers();
     if (kOnce && all_hits == 0) break;
-    const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, if there is one
+    const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, or -1
     float left_over = transmittance;
     Vec2<float> moved = position;
     const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), left_over, moved);
@@ -217,7 +211,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
       if (kKeep) blend.last[0] = b.mask ? pair + 1 : blend.last[0];
     }
     if (kKeep && (hits & -hits & at_checkpoint) != 0)
-      checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
+      checkpoints.store_up_to(stage.pairs[own_splat - own + first], blend.samples);
     left_over = shuffle(left_over, first);
     moved = {shuffle(moved.x, first), shuffle(moved.y, first)};
     if (hits != 0) {
@@ -227,11 +221,11 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     }
     if constexpr (!kOnce) {
       if (hits == 0 || live == 0) {
-        taken += kAhead, left -= kAhead;
+        own_splat += kAhead, left -= kAhead;
         live = lanes_with_splats();
         if (live != 0) {
-          splat = stage.splats[taken];
-          pair = stage.pairs[taken];
+          splat = stage.splats[own_splat];
+          pair = stage.pairs[own_splat];
         }
       }
       if (!__any_sync(kAllLanes, live != 0)) break;
@@ -240,24 +234,24 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   }
 }
 
-/// Blends the pixels of a warp, as Layout shares them out, by queues; C channels from `first` on. `first_segment`: the
-/// number of the list's first segment. `kKeep`, `kSegment`: for a backward pass with segments of so many pairs.
+/// A warp blends its pixels by queues. Writes the channels [first, first + C). kKeep: for a backward pass. kSegment:
+/// pairs of a segment.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_queued(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
   constexpr int kLanes = Layout::kLanes;
-  const StatePlaces places(params.lists, list, params.grid, cut.tile);
+  const TileCheckpoints stored(params.lists, list, params.grid, cut.tile);
   MovingBlend<F, C, Layout, kKeep, true> blend(list, params.grid);
-  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + stored.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
   const int64_t words = pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
                 blend.pixel.inside ? list.count : 0);
-  // While splats are composited, the next ones are read, and the numbers of the ones after those.
+  // While splats are composited, the next are read.
   QueuedSplats<F, C, Layout> next(params, list, first);
   next.take_next(queues);
   queues.fill();
-  if (list.count > 0) next.advance(queues);  // of an empty scene there is no splat that all lanes could read
+  if (list.count > 0) next.advance(queues);  // else there may be no splat to read
   const int first_staged = lane_id() / kLanes * kLanes;
   const uint32_t lanes_of_pixel = (kAllLanes >> (32 - kLanes)) << (lane_id() / kLanes * kLanes);
   while (__any_sync(kAllLanes, next.n > 0)) {
@@ -271,7 +265,7 @@ __device__ void blend_queued(const BlendParams& params, int first, const CutList
       queues.count = 0, queues.begin = queues.end;
       next.n = next.next_n = 0;
     }
-    __syncwarp();  // all have read the splats
+    __syncwarp();
   }
   if constexpr (kKeep) blend.last[0] = Layout::max_of_sharers(blend.last[0]);
   blend.write(params, first);

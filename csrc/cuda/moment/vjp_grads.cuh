@@ -1,17 +1,18 @@
-// A library for the backward kernels of footprints whose samples move: what they read for a lane's pixel. That is the
-// gradient of the image (dL_dimage, dL_dalpha), and `last` of blend: how far into the list each sample has composited.
+// A library for the backward kernels of moment/. VjpLane reads `last` and the gradient of the image for a lane's pixel.
+// It has the state that goes from splat to splat.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
-/// Which sums of a pair a kernel for C channels from `first` on makes, besides those of its channels.
+/// What a kernel for the channels [first, first + C) sums besides these channels. PairGrad is linear in the gradient,
+/// so that each kernel adds its share. MeanSums need all channels: the first kernel makes them, and all of PairGrad.
 template <int C> struct WantedSums {
-  static constexpr bool kMany = C > kFewChannels;  ///< `first` may be above 0, and there may be more channels than C
+  static constexpr bool kMany = C > kFewChannels;  ///< there may be several kernels
   bool shape;                                      ///< PairGrad
   bool means;                                      ///< MeanSums
-  bool others;                                     ///< with the share of the channels of other kernels
+  bool others;                                     ///< with the channels of other kernels
 
   __device__ WantedSums(const BlendVjpParams& params, int first) {
     const bool is_first = !kMany || first == 0;
@@ -21,7 +22,6 @@ template <int C> struct WantedSums {
   }
 };
 
-/// The gradient with respect to a sample of a lane's pixel.
 template <class F, int C> struct SampleGrad {
   Values<C> channels;  ///< from `first` on
   float through;       ///< scalar product with the background
@@ -39,7 +39,7 @@ template <class F, int C> struct SampleGrad {
       for (int c = C; c < params.channels.count; ++c)
         through += sample_gradient<F>(params, pixel, c) * params.background[c];
     }
-    // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
+    // Alpha is 1 - transmittance: a channel with background -1.
     if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   }
 
@@ -58,12 +58,10 @@ template <class F, int C> struct SampleGrad {
   }
 };
 
-/// The number of pairs of the tile's list up to the last splat that was composited: into each of a lane's samples, and
-/// into any sample of its warp.
+/// Number of pairs up to the last that was composited into each sample, and into any of the warp.
 template <class F, class Layout> struct SamplesLast {
   int samples[Layout::kCells], warp = 0;
 
-  /// All lanes must call it.
   __device__ SamplesLast(const int32_t* last, const Pixel& pixel) {
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
@@ -73,7 +71,7 @@ template <class F, class Layout> struct SamplesLast {
     }
     warp = warp_max(warp);
   }
-  /// The same for any sample of the block. `of_warps`: in shared memory. All threads of a block must call it.
+  /// Into any of the block. All threads must call it.
   __device__ int of_block(int (&of_warps)[Layout::kWarps]) const {
     if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
     __syncthreads();
@@ -86,11 +84,11 @@ template <class F, class Layout> struct SamplesLast {
 
 /// What a sample carries from a splat to the splat before it.
 struct Adjoint {
-  float later;               ///< gradient-weighted colour of everything later in the list
-  Vec2<float> dL_dposition;  ///< times kMoveGradUnit of the footprint
+  float later;               ///< gradient-weighted colour of all later splats
+  Vec2<float> dL_dposition;  ///< times F::kMoveGradUnit
 };
 
-/// A lane of a backward kernel: its pixel, and its samples on their way through a list.
+/// A lane of a backward kernel, and its samples on their way through a list.
 template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout>> struct VjpLane {
   static constexpr int kCells = Layout::kCells;
   using Samples = MovingSamples<F, Layout, kTogether>;
@@ -101,14 +99,12 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   SampleGrad<F, C> grad;
   Adjoint adjoint[kCells];
 
-  /// All lanes must call it.
   __device__ VjpLane(const BlendVjpParams& params, const TileList& list)
       : pixel(list, params.grid, Layout::pixel()),
         corners(Layout::pixel()),
         samples(pixel.inside),
         last(params.last, pixel) {}
-  /// Reads the gradient of the image. Sets `adjoint` to what it is after all splats, where there is only the
-  /// background.
+  /// Reads the gradient of the image. `adjoint` is then that after all splats, where there is only the background.
   __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
     grad.read(params, pixel, first, wanted);
 #pragma unroll

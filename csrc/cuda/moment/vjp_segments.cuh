@@ -1,10 +1,7 @@
-// Kernel segment_vjp: the last step of the backward pass through lists that are cut, for footprints whose samples move.
-// launch_segment_vjp_kernel launches it after the kernels of maps.cuh. It reads adjoint_maps and checkpoints, takes
-// each segment back to front, and writes rows of pair_grads and channel_sums.
-//
-// The samples of neighbouring pixels are a group, which a warp takes through a segment. Groups do not have equally much
-// to do: in some all pixels have closed, or no splat is there. So a warp claims the next group when it is done with
-// one.
+// Kernel segment_vjp: the last step of the backward pass of moment/ for lists that are cut. blend_vjp_moment
+// (blend_vjp.cu) launches it after chain_maps. It reads adjoint_maps, checkpoints, `last` and splats, and writes rows
+// of pair_grads and channel_sums. A warp takes a group of pixels back through a segment. Groups are unequal work, so
+// warps claim one after another.
 #pragma once
 
 #include <algorithm>
@@ -13,35 +10,33 @@
 
 namespace ar::cuda {
 
-/// SegmentLayout with groups that are claimed, by fewer warps.
+/// Fewer warps, which claim groups.
 template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
 using ClaimedLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide,
                                  Cells::kGroups / groups_of_warp(F::kSamples, kSide < kMovingTile), true>;
 
-/// Whether the sums of the groups of a tile are in shared memory, or else in BlendVjpParams::group_sums.
+/// Whether sums of groups are in shared memory, else in group_sums [blocks, kGroups, kBatch, kSums].
 template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= kMostSumsInside;
 
-/// What a block of segment_vjp_kernel has in shared memory.
 template <class F, int C, class Layout, int kSegment>
 struct SegmentVjpShared
     : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>> {
   using Base = VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>>;
-  using Sums = typename Base::Sums;
-  int segment;     ///< that the block works on
-  int next_group;  ///< that a warp claims next
-  int last;        ///< number of pairs up to the last that was composited into any sample
+  using SumsOfGroup = typename Base::SumsOfGroup;
+  int segment;
+  int next_group;
+  int last;  ///< SamplesLast of all groups
 
-  /// Claims a group for the warp; false if none is left. All lanes must call it.
+  /// False if no group is left.
   __device__ bool claim_group() {
     int group = 0;
     if (lane_id() == 0) group = atomicAdd(&next_group, 1);
     group = shuffle(group, 0);
-    if (lane_id() == 0) taken_group() = group;
+    if (lane_id() == 0) claimed_group() = group;
     __syncwarp();
     return group < Layout::kGroups;
   }
-  /// Value v of the sums of all groups for pair j.
-  __device__ float total(const Sums* sums, int j, int v) const {
+  __device__ float total(const SumsOfGroup* sums, int j, int v) const {
     float sum = 0;
     for (uint32_t left = this->stage.reach[j]; left != 0; left &= left - 1) {
       const int group = __ffs(int(left)) - 1;
@@ -51,10 +46,10 @@ struct SegmentVjpShared
   }
 };
 
-/// Takes a group of a segment's samples back through the staged batch of pairs [k0, k1).
+/// Takes the warp's group back through the staged pairs [k0, k1).
 template <class F, int C, class Layout, int kSegment, class Shared>
 __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared, Shared& shared,
-                          typename Shared::Sums* sums, const TileList& list, const StatePlaces& places,
+                          typename Shared::SumsOfGroup* sums, const TileList& list, const TileCheckpoints& stored,
                           const ListSegment& segment, int k0, int k1, WantedSums<C> wanted) {
   using Lane = VjpLane<F, C, Layout, true>;
   const int begin = segment.index * kSegment, end = begin + kSegment;
@@ -62,8 +57,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   Lane lane(params, list);
   lane.begin(params, first, wanted);
   const int (&last)[Layout::kCells] = lane.last.samples;
-  // A sample's Adjoint after the batch is that of the background, of the next segment's map, or of the next batch,
-  // which stored it in the part of this segment's own map that nobody needs any more.
+  // Where a batch leaves the Adjoint for the next: in numbers of the segment's map that nobody needs any more.
   constexpr int kCarried = 3;
   const auto map_of = [&](int i) {
     return MapMemory<F, Layout::kTilePixels>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
@@ -76,7 +70,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   }
   EarlierPositions<Layout> earlier(sizeof(Shared), in_shared);
   batch_vjp(params, shared, group, sums[group], list, k0, wanted.means, lane, earlier, [&](int from) {
-    lane.samples.load(places.at<typename Lane::Samples>(params.checkpoints, k0 + from), k0 + from, last);
+    lane.samples.load(stored.at<typename Lane::Samples>(params.checkpoints, k0 + from), k0 + from, last);
   });
   if (k0 == begin) return;
 #pragma unroll
@@ -84,8 +78,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     if (last[i] > k0) map_of(i).put(segment.number, lane.adjoint[i], kCarried);
 }
 
-/// Each block claims one segment after the other. For the C channels from `first` on; `Layout`: a ClaimedLayout;
-/// `kSegment`: pairs of a segment; `in_shared`: of EarlierPositions, whose shared memory follows Shared.
+/// A block claims one segment after another. Reads the channels [first, first + C). `in_shared`: of EarlierPositions,
+/// which follow Shared in memory.
 template <class F, int C, class Layout, int kSegment>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, true>)
     segment_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
@@ -94,8 +88,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   static_assert(kSegment % Shared::kBatch == 0);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
   auto* const outside =
-      reinterpret_cast<typename Shared::Sums*>(params.group_sums) + int64_t(blockIdx.x) * Layout::kGroups;
-  auto* const sums = kSumsInside<Layout> ? reinterpret_cast<typename Shared::Sums*>(&shared.inside) : outside;
+      reinterpret_cast<typename Shared::SumsOfGroup*>(params.group_sums) + int64_t(blockIdx.x) * Layout::kGroups;
+  auto* const sums = kSumsInside<Layout> ? reinterpret_cast<typename Shared::SumsOfGroup*>(&shared.inside) : outside;
   const WantedSums<C> wanted(params, first);
   const int warp = threadIdx.x / 32, lane = lane_id();
   while (true) {
@@ -108,9 +102,9 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     const ListSegment segment(*params.plan, params.chunk_order, shared.segment);
     if (segment.tile < 0) return;
     const TileList list = list_of(params.lists, params.grid, segment.tile);
-    const StatePlaces places(params.lists, list, params.grid, segment.tile);
+    const TileCheckpoints stored(params.lists, list, params.grid, segment.tile);
     for (int group = warp; group < Layout::kGroups; group += Layout::kWarps) {
-      if (lane == 0) taken_group() = group;
+      if (lane == 0) claimed_group() = group;
       __syncwarp();
       const SamplesLast<F, Layout> lasts(params.last, Pixel(list, params.grid, Layout::pixel()));
       if (lane == 0) atomicMax(&shared.last, lasts.warp);
@@ -127,7 +121,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
       if (threadIdx.x == 0) shared.next_group = 0;
       __syncthreads();
       while (shared.claim_group())
-        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums, list, places, segment, k0, k1,
+        group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums, list, stored, segment, k0, k1,
                                           wanted);
       __syncthreads();
       shared.write(params, first, wanted, list, k1 - k0, [&](int j, int v) { return shared.total(sums, j, v); });
@@ -135,15 +129,15 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   }
 }
 
-/// Blocks of segment_vjp_kernel: as many as are on the device at once.
+/// As many as can be resident.
 template <int C, class Layout> int64_t segment_vjp_blocks(int64_t segments) {
   return std::min(segments, int64_t(multiprocessors()) * kMovingVjpBlocks<C, Layout, true>);
 }
-/// Numbers of BlendVjpParams::group_sums that segment_vjp_kernel needs.
+/// Of BlendVjpParams::group_sums.
 template <class F, int C, class Layout, int kSegment> int64_t group_sums_of(int64_t segments) {
-  using Sums = typename SegmentVjpShared<F, C, Layout, kSegment>::Sums;
+  using SumsOfGroup = typename SegmentVjpShared<F, C, Layout, kSegment>::SumsOfGroup;
   if (kSumsInside<Layout>) return 0;
-  return segment_vjp_blocks<C, Layout>(segments) * Layout::kGroups * int64_t(sizeof(Sums) / sizeof(float));
+  return segment_vjp_blocks<C, Layout>(segments) * Layout::kGroups * int64_t(sizeof(SumsOfGroup) / sizeof(float));
 }
 
 }  // namespace ar::cuda

@@ -1,6 +1,5 @@
-// A library for the backward kernels of footprints whose samples move: the sums over pixels that make the gradient of a
-// pair. Each warp writes the sums of its pixels to shared memory or, for some segments, to BlendVjpParams::group_sums;
-// write_pairs adds up the warps and writes rows of pair_grads and channel_sums.
+// A library for the backward kernels of moment/: sums over pixels, which are the gradient of a pair. Warps write sums
+// to shared memory or to group_sums. VjpBatch::write adds them up and writes rows of pair_grads and channel_sums.
 #pragma once
 
 #include "cuda/moment/vjp_grads.cuh"
@@ -9,19 +8,19 @@ namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
-/// A batch of pairs that a backward block works on, in shared memory.
+/// kPairs pairs in shared memory; with kInside also the sums of groups.
 template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatch {
   static constexpr int kBatch = kPairs, kChunks = kPairs / kStateChunk;
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// What a group writes for each pair: PairGrad, C channels, MeanSums.
-  using Sums = float[kPairs][kSums];
+  /// Of a group: PairGrad, C channels, MeanSums.
+  using SumsOfGroup = float[kPairs][kSums];
   MovingStage<F, C, Layout, kPairs> stage;
-  uint32_t hits[Layout::kGroups][kChunks];  ///< pairs that have sums of a group
+  uint32_t hits[Layout::kGroups][kChunks];  ///< pairs with sums of a group
   int32_t rows[kPairs];
   Mat2<float> mean_maps[kPairs];
-  std::conditional_t<kInside, Sums[Layout::kGroups], char> inside;  ///< of each group
+  std::conditional_t<kInside, SumsOfGroup[Layout::kGroups], char> inside;
 
-  /// Loads splat `id` of pair k0 + t, if it is not -1, with channels from `first` on.
+  /// Loads splat `id`, unless -1, of pair k0 + t.
   __device__ void load(int t, const BlendVjpParams& params, int first, const TileList& list, int k0, int32_t id,
                        bool with_means) {
     stage.load_one(t, params, first, list, id);
@@ -31,8 +30,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
   __device__ bool is_hit(int group, int j) const { return hits[group][j / kStateChunk] >> (j % kStateChunk) & 1; }
 
-  /// Writes the sums total(j, v) of the first `count` pairs. To the six sums it adds what the kernels of earlier
-  /// channels have written.
+  /// Writes total(j, v) of the first `count` pairs. PairGrad is added to that of earlier channels.
   template <class Total>
   __device__ void write(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list, int count,
                         Total&& total) const {
@@ -44,7 +42,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
 
  private:
-  /// The first kUsed sums of each pair: a constant, so that divisions by it cost little.
+  /// kUsed sums of a pair: a constant, so that divisions by it cost little.
   template <int kUsed, class Total>
   __device__ void write_first(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list,
                               int count, Total&& total) const {
@@ -70,7 +68,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
 };
 
-/// Clears the rows of the pairs [begin, end), which nothing reached.
+/// Clears the rows of pairs that no sample composited.
 template <int kThreads>
 __device__ void clear_pairs(const BlendVjpParams& params, const TileList& list, int begin, int end, int first) {
   if (first % kChannelGroup != 0 || list.of_patch) return;
@@ -78,11 +76,10 @@ __device__ void clear_pairs(const BlendVjpParams& params, const TileList& list, 
     clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
 }
 
-/// The number of the sum that a lane has after put_warp_sums.
+/// The sum that a lane gets from put_warp_sums.
 template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
 
-/// Sums PairGrad and `channels` over a warp into `sums`, the address of sum sum_of_lane() of the pair. All lanes must
-/// call it.
+/// `sums`: address of the lane's sum_of_lane().
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
   float values[C <= kFewChannels ? 6 + C : 8] = {shape.offset.x, shape.offset.y, shape.shape.xx,
@@ -90,7 +87,7 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-    *sums = sum_values(values);  // by all lanes, which costs less than to find the first of each sum
+    *sums = sum_values(values);  // by all lanes: cheaper than a test
   } else {
     static_assert(C == 8);
     const float sum = sum_values(values), of_channels = sum_values(channels.v);
@@ -101,8 +98,7 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   }
 }
 
-/// Sums MeanSums over a warp into sums[0] and sums[1]; `offset`: ShapeGrad::offset summed over the lane's samples. All
-/// lanes must call it.
+/// Into sums[0] and sums[1]. `offset`: summed over the lane's samples.
 template <class Layout>
 __device__ void put_warp_means(const BlendVjpParams& params, const Mat2<float>& mean_map, Vec2<float> offset,
                                float* sums) {
@@ -110,7 +106,7 @@ __device__ void put_warp_means(const BlendVjpParams& params, const Mat2<float>& 
   offset = {Layout::sum_lanes(offset.x), Layout::sum_lanes(offset.y)};
   const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
   Vec2<float> means = mean_sums_of(params.mean_sums, size, transform_transposed(mean_map, offset));
-  if (Layout::first_sample() > 0) means = {0, 0};  // once for a pixel
+  if (Layout::first_sample() > 0) means = {0, 0};
   means = {warp_sum(means.x), warp_sum(means.y)};
   if (lane < 2) sums[lane] = lane == 0 ? means.x : means.y;
 }

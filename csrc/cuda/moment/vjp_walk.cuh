@@ -1,15 +1,10 @@
-// Kernel moving_vjp: the backward pass of footprints whose samples move, for lists that are not cut. A block per tile,
-// a lane per few cells of a pixel, back to front; blend_vjp_moment (blend_vjp.cu) launches it. It reads the checkpoints
-// and `last` of blend and writes rows of pair_grads and channel_sums. vjp_segments.cuh has the kernel for lists that
-// are cut, and uses replay_chunk and chunk_vjp of this file.
+// Kernel moving_vjp: the backward pass of moment/ for lists that are not cut. blend_vjp_moment (blend_vjp.cu) launches
+// it. It reads splats, checkpoints, `last` and the gradient of the image, and writes rows of pair_grads and
+// channel_sums. segment_vjp also uses batch_vjp and launch_vjp.
 //
-// The state of a sample before a splat does not follow from the state after it, since the displacement depends on
-// itself through alpha. So a warp composites each chunk of 32 splats once more from the checkpoint before it, stores
-// where the samples were before each splat, and then walks back over the splats that its pixels show.
-//
-// dL/dalpha is linear in the gradient of the image: with many channels each kernel adds the share of its channels to
-// the six sums of a pair, which a single block owns. Only MeanSums need all channels at once: where they are wanted,
-// the first kernel makes all sums, and reads the channels of the others from memory.
+// The state before a splat does not follow from the state after it. So a warp composites each chunk of 32 splats once
+// more from the checkpoint before it, and stores the positions before each splat. Then it walks back over the splats
+// that its pixels show.
 #pragma once
 
 #include <algorithm>
@@ -20,14 +15,13 @@
 
 namespace ar::cuda {
 
-/// Resident blocks of moving_vjp_kernel and, with kSegments, of segment_vjp_kernel.
+/// Resident blocks of moving_vjp_kernel or, with kSegments, segment_vjp_kernel.
 template <int C, class Layout, bool kSegments>
 inline constexpr int kMovingVjpBlocks =
     blocks_per_sm(std::max(moving_vjp_threads(C, Layout::kCells, kSegments) / Layout::kThreads, 1), Layout::kThreads);
 
-/// The positions of a lane's samples before each splat of a chunk that reaches its warp. Positions before the first few
-/// splats are in shared memory, as far as there is room, the others in local memory, of which the caches hold only a
-/// part.
+/// Positions of a lane's samples before each splat of a chunk that reaches its warp. The first in_shared are in shared
+/// memory, the others in local memory.
 template <class Layout> struct EarlierPositions {
   static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
   struct alignas(kTogether * sizeof(Vec2<float>)) Together {
@@ -35,22 +29,22 @@ template <class Layout> struct EarlierPositions {
   };
   using OfWarp = Together[kCells / kTogether][32];
   using Positions = Vec2<float>[kCells];
-  /// Bytes of shared memory that a block needs for each splat.
+  /// Of shared memory, for each splat of a block.
   static constexpr size_t kBytes = Layout::kWarps * sizeof(OfWarp);
-  /// The number of splats whose positions are in shared memory is a multiple of this number.
+  /// in_shared is a multiple of it.
   static constexpr int kUnit = kListAhead<Layout>;
 
   int begin, in_shared;
   Together local[kStateChunk][kCells / kTogether];
 
-  /// The shared memory from byte `begin` on is for the positions before so many splats.
+  /// From byte `begin` of shared memory on.
   __device__ EarlierPositions(size_t begin, int splats)
       : begin(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared(splats) {}
-  /// Not a member: the compiler has to see that it points to shared memory.
+  /// The compiler has to see that this is shared memory.
   __device__ OfWarp* shared() const {
     return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin);
   }
-  /// Before splat n of the list; kShared: n < in_shared.
+  /// kShared: n < in_shared.
   template <bool kShared> __device__ void put(int n, const Positions& positions) {
 #pragma unroll
     for (int i = 0; i < kCells; i += kTogether) {
@@ -73,9 +67,8 @@ template <class Layout> struct EarlierPositions {
   }
 };
 
-/// Composites the staged splats in [from, from + 32) that reach the warp, and lists them; `k0`: the pair that is staged
-/// first. Stores the positions of the samples before each in `earlier` (EarlierPositions, or null), and returns which
-/// listed splats a sample of the warp shows.
+/// Composites the staged splats [from, from + 32) that reach the warp; pair k0 is staged first. Writes positions to
+/// `earlier`, unless null. Returns which listed splats any sample shows.
 template <class Stage, class F, int C, class Layout, bool kTogether, class Earlier>
 __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, Layout, kTogether>& lane,
                                  Earlier earlier) {
@@ -106,27 +99,10 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, L
   return warp_or(shown);
 }
 
-/// Takes a lane's samples and their Adjoint from after pair k to before it, where the samples are at `positions`.
-/// Returns the sums over the samples. `g_color`: the scalar product of the splat's channels and the gradient.
-template <class F, int C, class Layout, bool kTogether>
-__device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k, float g_color,
-                                            const Vec2<float> (&positions)[Layout::kCells],
-                                            VjpLane<F, C, Layout, kTogether>& lane) {
-  MovingBlendGrad<float> sums = no_moving_blend_grad<float>();
-#pragma unroll
-  for (int i = 0; i < Layout::kCells; ++i) {
-    const auto [z, raw] = lane.corners.see(splat.terms, i, positions[i]);
-    const bool composited = raw >= float(kAlphaMin) && k < lane.last.samples[i];
-    add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
-                             lane.samples.transmittance[i], lane.adjoint[i].later, lane.adjoint[i].dL_dposition, sums);
-  }
-  return sums;
-}
-
-/// Takes a group of samples back through the batch that begins with pair k0, and writes the sums of each pair to `sums`
-/// and shared.hits[group]. load(from) brings the samples to before the staged splat `from`. All lanes must call it.
+/// Takes a group back through the batch from pair k0 on, and writes its sums and hits. load(from) brings the samples to
+/// before staged splat `from`.
 template <class F, int C, class Layout, bool kTogether, class Shared, class Load>
-__device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int group, typename Shared::Sums& sums,
+__device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int group, typename Shared::SumsOfGroup& sums,
                           const TileList& list, int k0, bool with_means, VjpLane<F, C, Layout, kTogether>& lane,
                           EarlierPositions<Layout>& earlier, Load&& load) {
   for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
@@ -144,7 +120,16 @@ __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int grou
       const float g_color = lane.grad.times(splat.channels, params, lane.pixel, [&] { return list.splat(k0 + j); });
       Vec2<float> positions[Layout::kCells];
       earlier.get(n, positions);
-      const auto [contribution, of_splat] = walk_back(splat, k0 + j, g_color, positions, lane);
+      MovingBlendGrad<float> of_cells = no_moving_blend_grad<float>();
+#pragma unroll
+      for (int i = 0; i < Layout::kCells; ++i) {
+        const auto [z, raw] = lane.corners.see(splat.terms, i, positions[i]);
+        const bool composited = raw >= float(kAlphaMin) && k0 + j < lane.last.samples[i];
+        add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
+                                 lane.samples.transmittance[i], lane.adjoint[i].later, lane.adjoint[i].dL_dposition,
+                                 of_cells);
+      }
+      const auto& [contribution, of_splat] = of_cells;
       if (with_means)
         put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums[j] + Shared::kMeans);
       const PairGrad<float> of_pair = {of_splat.sums, of_splat.weighted};
@@ -155,13 +140,11 @@ __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int grou
   }
 }
 
-/// What a block of moving_vjp_kernel has in shared memory. Two chunks with one cell of a lane; with more cells one,
-/// which leaves more shared memory for the positions of samples.
+/// Batches are short where positions take much shared memory.
 template <class F, int C, class Layout>
 struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, true> {
-  int last[Layout::kWarps];  ///< of SamplesLast
+  int last[Layout::kWarps];
 
-  /// Value v of the sums of all warps for pair j.
   __device__ float total(int j, int v) const {
     float sum = 0;
 #pragma unroll
@@ -172,8 +155,8 @@ struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kState
   }
 };
 
-/// A block per tile whose list is not cut. For the C channels from `first` on; `Layout`: a CellLayout; `in_shared`: of
-/// EarlierPositions, whose shared memory follows Shared.
+/// A block per tile whose list is not cut. Reads the channels [first, first + C). `in_shared`: of EarlierPositions,
+/// which follow Shared in memory.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, false>)
     moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
@@ -187,7 +170,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   const int tile = listed_tile(params, params.plan->counts.segments + int(blockIdx.x)), warp = threadIdx.x / 32;
   if (tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const StatePlaces places(params.lists, list, params.grid, tile);
+  const TileCheckpoints stored(params.lists, list, params.grid, tile);
   const WantedSums<C> wanted(params, first);
   Lane lane(params, list);
   const int stop = lane.last.of_block(shared.last);
@@ -197,10 +180,10 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   int k0 = (stop - 1) / kBatch * kBatch;
   int32_t id = shared.stage.splat_of(list, k0, stop);
   for (int k1 = stop; k1 > 0; k1 = k0, k0 -= kBatch) {
-    if (places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
-      const int checkpoint = k0 / places.spacing;
-      int k = checkpoint * places.spacing;
-      lane.samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k,
+    if (stored.spacing > kStateChunk) {  // too many pairs: from the checkpoint to the batch
+      const int checkpoint = k0 / stored.spacing;
+      int k = checkpoint * stored.spacing;
+      lane.samples.load(params.checkpoints + (stored.first + checkpoint - 1) * Samples::kCheckpoint, k,
                         lane.last.samples);
       for (; k < k0; k += kBatch) {
         __syncthreads();
@@ -213,15 +196,15 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
     __syncthreads();  // all have read what the last batch left
     if (threadIdx.x < kBatch) shared.load(int(threadIdx.x), params, first, list, k0, id, wanted.means);
     __syncthreads();
-    if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
+    if (next_id >= 0) prefetch_splat(params.splats, next_id);
     id = next_id;
     const Samples at_batch = lane.samples;
     batch_vjp(params, shared, warp, shared.inside[warp], list, k0, wanted.means, lane, earlier, [&](int from) {
-      if (places.spacing > kStateChunk) {
+      if (stored.spacing > kStateChunk) {
         lane.samples = at_batch;
         for (int ahead = 0; ahead < from; ahead += kStateChunk) replay_chunk(shared.stage, ahead, k0, lane, nullptr);
       } else {
-        lane.samples.load(places.at<Samples>(params.checkpoints, k0 + from), k0 + from, lane.last.samples);
+        lane.samples.load(stored.at<Samples>(params.checkpoints, k0 + from), k0 + from, lane.last.samples);
       }
     });
     __syncthreads();
@@ -229,8 +212,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   }
 }
 
-/// Launches `kernel`, which has Shared in shared memory, and as much of EarlierPositions as leaves room for
-/// kMovingVjpBlocks on a multiprocessor.
+/// With as many positions in shared memory as let kMovingVjpBlocks blocks be resident.
 template <class Shared, int C, class Layout, bool kSegments, class Kernel>
 void launch_vjp(Kernel kernel, const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
   using Earlier = EarlierPositions<Layout>;

@@ -1,8 +1,6 @@
-// Kernel moving_blend: the forward pass of footprints whose samples move, for the lists that are not cut. A block per
-// tile walks its whole list, because what a splat does to a sample depends on where the sample is when they meet. The
-// device is filled by spreading samples over lanes and by small tiles. It reads lists, splats and the plan, and writes
-// images, and for a backward pass transmittance, `last` and checkpoints. blend_moment (launch.cuh) launches it; lists
-// that are cut have the kernels of listed.cuh.
+// Kernel moving_blend: the forward pass of moment/ for lists that are not cut into segments. blend_moment (blend.cu)
+// launches it. A block walks the whole list of a tile, since the position of a node depends on all earlier splats. It
+// reads plan, lists and splats and writes images, and for a backward pass transmittance, `last` and checkpoints.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -13,26 +11,26 @@ namespace ar::cuda {
 template <class Layout, int C>
 inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / Layout::kThreads, 1), Layout::kThreads);
 
-/// A block per tile, which returns at once if the tile's list is cut, and one block more that only waits
-/// (begin_beside_earlier_kernels). Blends the C channels from `first` on. `beside`: the kernels for lists that are cut
-/// were launched just before, and may still run. `F`: the footprint, `Layout`: a CellLayout, `kKeep`: stores
-/// checkpoints and `last` for a backward pass.
+/// Block b has tile plan.tile_order[b], unless its list is cut; the last block only waits
+/// (begin_beside_earlier_kernels). Writes the channels [first, first + C) of the image, and alpha. `beside`:
+/// listed_blend_kernel was launched just before. kKeep: also writes transmittance, `last`, and checkpoints as
+/// TileCheckpoints and MovingSamples lay them out.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
   if (begin_beside_earlier_kernels(beside)) return;
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   constexpr int kListed = kKeep ? kStateChunk : kBatch;
-  // Where a lane has many samples whose last splats have to be kept, lists would take too many registers.
+  // Last entries of many samples would take too many registers.
   constexpr bool kLists = !kKeep || Layout::kCells <= 2;
   using Stage = MovingStage<F, C, Layout, kBatch, kListed, true>;
   __shared__ Stage stage;
   const int tile = params.plan.tile_order[blockIdx.x];
   const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
   const TileList list = list_of(params.lists, params.grid, tile);
-  // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
+  // With too many pairs no list is cut. One condition saves registers.
   if (is_cut && !list.of_patch) return;
-  const StatePlaces places(params.lists, list, params.grid, tile);
+  const TileCheckpoints stored(params.lists, list, params.grid, tile);
   MovingBlend<F, C, Layout, kKeep> blend(list, params.grid);
   int32_t id = stage.splat_of(list, 0, list.count);
   for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
@@ -40,17 +38,17 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
     stage.load(params, first, list, id);
     __syncthreads();
-    if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
+    if (next_id >= 0) prefetch_splat(params.splats, next_id);
     id = next_id;
     for (int from = 0; from < count; from += kListed) {
-      if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;  // no checkpoint is needed
-      if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
+      if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;
+      if (kKeep && k + from > 0 && (k + from) % stored.spacing == 0)
         blend.samples.store(params.checkpoints +
-                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
+                            (stored.first + (k + from) / stored.spacing - 1) * blend.samples.kCheckpoint);
       if constexpr (kLists) {
         constexpr int kCells = Layout::kCells;
         const int listed = stage.lists.list(stage.reach, from, min(count, from + kListed));
-        int shown[kCells];  // the entry of the last splat that was composited into each sample
+        int shown[kCells];  // last entry that each sample shows
 #pragma unroll
         for (int i = 0; i < kCells; ++i) shown[i] = -1;
         for (int n = 0; n < listed; n += kBetweenVotes) {
