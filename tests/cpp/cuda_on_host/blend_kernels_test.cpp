@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/still/front.cuh"
+#include "cuda/still/tail.cuh"
 #include "random_splats.h"
 
 namespace ar::cuda {

@@ -105,23 +105,23 @@ template <class F, int C> struct Scene {
   }
 
   /// Runs `blocks` blocks for chunks [first, end) and adds to `sums`. Returns how often a warp asked for a chunk.
-  template <Sums kSums> int run(int blocks, int first, int end, std::vector<float>& sums) {
+  template <bool kMeans> int run(int blocks, int first, int end, std::vector<float>& sums) {
     static_assert(sizeof(VjpShared<F, C>) <= sizeof dynamic_memory);
     plan.counts.chunks = end;
     int32_t taken = first;
     params.chunks_taken = &taken;
     params.pair_grads = sums.data();
     for (float4& numbers : dynamic_memory) numbers = {NAN, NAN, NAN, NAN};
-    cuda_on_host::launch(blocks, 32 * vjp_warps(S), [&] { blend_vjp_kernel<F, C, kSums>(params); });
+    cuda_on_host::launch(blocks, 32 * vjp_warps(S), [&] { blend_vjp_kernel<F, C, kMeans>(params); });
     return taken - first;
   }
 };
 
-template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow) {
-  SCOPED_TRACE(testing::Message() << F::kSamples << " samples, Sums " << int(kSums) << ", overflow " << overflow);
+template <class F, bool kMeans> void expect_the_same_from_few_warps(bool overflow) {
+  SCOPED_TRACE(testing::Message() << F::kSamples << " samples, MeanSums " << kMeans << ", overflow " << overflow);
   constexpr int kBlocks = 2, kWarps = kBlocks * vjp_warps(F::kSamples);
-  constexpr int kColumns = kSums == Sums::kGrads ? kPairMeans : kPairMeans + 2;
-  Scene<F, 3> scene(kSums == Sums::kGrads ? MeanSums::kNone : MeanSums::kNorm, overflow);
+  constexpr int kColumns = kMeans ? kPairMeans + 2 : kPairMeans;
+  Scene<F, 3> scene(kMeans ? MeanSums::kNorm : MeanSums::kNone, overflow);
   const int end = int(scene.chunks.size());
   ASSERT_GT(end, kWarps);
   const size_t numbers = size_t(scene.rows) * kPairGradWidth;
@@ -129,13 +129,13 @@ template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow
   std::vector<double> expected(numbers), size(numbers);
   for (int chunk = 0; chunk < end; ++chunk) {
     std::vector<float> sums(numbers);
-    scene.template run<kSums>(1, chunk, chunk + 1, sums);
+    scene.template run<kMeans>(1, chunk, chunk + 1, sums);
     for (size_t i = 0; i < numbers; ++i) expected[i] += sums[i], size[i] += std::abs(sums[i]);
   }
   ASSERT_GT(*std::max_element(size.begin(), size.end()), 0);
   std::vector<float> sums(numbers, overflow ? 0 : NAN);
   // Every chunk once, and every warp once more, to find that none is left.
-  EXPECT_EQ(scene.template run<kSums>(kBlocks, 0, end, sums), end + kWarps);
+  EXPECT_EQ(scene.template run<kMeans>(kBlocks, 0, end, sums), end + kWarps);
   for (size_t i = 0; i < numbers; ++i) {
     if (int(i % kPairGradWidth) >= kColumns) continue;
     // What tiles add to a row is added in another order: a rounding for each of them.
@@ -265,9 +265,9 @@ template <class F, int C> void expect_sums_of_pixels(MeanSums mean_sums) {
   std::vector<float> sums(size_t(scene.rows) * kPairGradWidth, NAN);
   const int end = int(scene.chunks.size());
   if (with_means) {
-    scene.template run<Sums::kBoth>(2, 0, end, sums);
+    scene.template run<true>(2, 0, end, sums);
   } else {
-    scene.template run<Sums::kGrads>(2, 0, end, sums);
+    scene.template run<false>(2, 0, end, sums);
   }
   const std::vector<Sum> expected = expected_sums(scene);
   int compared = 0;
@@ -332,8 +332,8 @@ TYPED_TEST_SUITE(BlendVjpKernel, Gaussians);
 
 TYPED_TEST(BlendVjpKernel, FewWarpsLeaveWhatAWarpForEachChunkLeaves) {
   for (const bool overflow : {false, true}) {
-    expect_the_same_from_few_warps<TypeParam, Sums::kGrads>(overflow);
-    expect_the_same_from_few_warps<TypeParam, Sums::kBoth>(overflow);
+    expect_the_same_from_few_warps<TypeParam, false>(overflow);
+    expect_the_same_from_few_warps<TypeParam, true>(overflow);
   }
 }
 

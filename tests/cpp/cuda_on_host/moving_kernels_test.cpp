@@ -162,7 +162,7 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(
     using Shared = SegmentVjpShared<F, kColors, Layout, kSegment>;
     constexpr int kBlocks = 3, kInShared = EarlierPositions<Layout>::kUnit;  // fewer blocks than segments
     static_assert(sizeof(Shared) + kInShared * EarlierPositions<Layout>::kBytes <= sizeof dynamic_memory);
-    std::vector<typename Shared::SumsOfGroup> group_sums(kBlocks * Layout::kGroups);
+    std::vector<typename Shared::Sums> group_sums(kBlocks * Layout::kGroups);
     vjp.group_sums = &group_sums[0][0][0];
     cuda_on_host::launch(kBlocks, Layout::kThreads,
                          [&] { segment_vjp_kernel<F, kColors, Layout, kSegment>(vjp, 0, kInShared); });

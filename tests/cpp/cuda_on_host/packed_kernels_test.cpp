@@ -286,8 +286,9 @@ TEST(PackedKernels, GradientsOfCamerasAreAdded) {
   const auto run = [&](Gradients& to, const std::vector<int32_t>& of_rows, bool add) {
     p.grads = to.view();
     p.rows.rows = of_rows.data();
-    cuda_on_host::launch(kBlocks, kProjectThreads,
-                         [&] { add ? add_project_rows_vjp_kernel<Cam>(p) : project_rows_vjp_kernel<Cam>(p); });
+    cuda_on_host::launch(kBlocks, kProjectThreads, [&] {
+      add ? project_vjp_kernel<Cam, FromRows, StagedGrads>(p) : project_vjp_kernel<Cam, FromRows>(p);
+    });
   };
   run(one, places, false);
   run(other, others, false);
