@@ -162,7 +162,7 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(
     using Shared = SegmentVjpShared<F, kColors, Layout, kSegment>;
     constexpr int kBlocks = 3, kInShared = EarlierPositions<Layout>::kUnit;  // fewer blocks than segments
     static_assert(sizeof(Shared) + kInShared * EarlierPositions<Layout>::kBytes <= sizeof dynamic_memory);
-    std::vector<typename Shared::Sums> group_sums(kBlocks * Layout::kGroups);
+    std::vector<typename Shared::SumsOfGroup> group_sums(kBlocks * Layout::kGroups);
     vjp.group_sums = &group_sums[0][0][0];
     cuda_on_host::launch(kBlocks, Layout::kThreads,
                          [&] { segment_vjp_kernel<F, kColors, Layout, kSegment>(vjp, 0, kInShared); });
@@ -304,7 +304,7 @@ template <class F> void expect_checkpoints_apart(const Scene<F>& scene) {
   std::vector<int> owner(scene.lists.capacity / kStateChunk, -1);
   for (int tile = 0; tile < scene.grid.tiles(); ++tile) {
     const TileList list = list_of(scene.lists, scene.grid, tile);
-    const StatePlaces places(scene.lists, list, scene.grid, tile);
+    const TileCheckpoints places(scene.lists, list, scene.grid, tile);
     for (int k = places.spacing; k < list.count; k += places.spacing) {
       const int64_t at = places.first + k / places.spacing - 1;
       ASSERT_TRUE(at >= 0 && at < int64_t(owner.size())) << tile;
