@@ -1,5 +1,6 @@
 // Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
-// adjoint"). A library for the loops of cpu/ and cuda/.
+// adjoint"). A library for the loops of cpu/ and cuda/. For samples that move, map_placed_sample makes the AdjointMap
+// of a segment. mean_sums_of makes a pixel's part of MeanSums.
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.

@@ -1,5 +1,5 @@
 // What project.h, covariance.h and blur.h ask of a camera with any model: a mean's pixel, the Jacobian there, the blur,
-// and the adjoints. The models are in core/camera/. Every function is compiled for two types. Camera is the pinhole of
+// and the adjoints. The models are in core/camera/. Most functions are compiled for two types. Camera is the pinhole of
 // 3DGS. FullCamera has all models and effects as branches, which all threads take alike: projecting is a small part of
 // a frame.
 #pragma once

@@ -1,4 +1,4 @@
-// Constants that the whole pipeline shares, most of them of 3DGS. The viewer's page has copies, which a test compares.
+// Constants that the whole pipeline shares: those of 3DGS, sizes of tiles, and limits that keep float32 finite. The viewer's page has copies, which a test compares.
 #pragma once
 
 namespace ar {

@@ -1,5 +1,5 @@
-// What density control sums up for every Gaussian over the pictures of a training. cpu/activations.cpp and
-// cuda/activations.cu run it.
+// Adds one picture to the statistics of density control, per Gaussian: the length of the gradient by means2D, and a view
+// where the radius is above 0. cpu/activations.cpp and cuda/activations.cu call it.
 #pragma once
 
 #include <cmath>

@@ -1,4 +1,4 @@
-// Only structs. Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: what
+// Structs of a camera. Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: what
 // lens and shutter add to a covariance in the image; blur_of() in camera.h makes it, blur.h applies it.
 #pragma once
 

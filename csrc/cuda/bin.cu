@@ -1,5 +1,5 @@
 // Launches the kernels of bin.cuh, sort.cuh and plan.cuh for torch/backend_cuda.cpp. What they read and write is
-// declared in stages.h.
+// declared in params.h.
 #include <algorithm>
 
 #include "cuda/bin.cuh"

@@ -1,5 +1,6 @@
-// Entry points of blending for csrc/torch. blend() and blend_vjp() call the family of kernels that the table of
-// dispatch.h names.
+// Entry points of blending for csrc/torch: blend, blend_vjp and inspect. blend and blend_vjp call the family of kernels
+// that the table of dispatch.h names. Before each group of a backward pass the kernel clear_sums sets chunks_taken to
+// zero and, where tiles share the lists of patches, the sums to which tiles add.
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/launch.cuh"

@@ -9,8 +9,8 @@
 // | box 4, fewer tiles                 | up to 4  | 8x8, a lane per sample         | still/    |
 // | box 16                             | up to 4  | 4x4, a lane per sample         | still/    |
 // | all of these                       | more     | the same                       | channels/ |
-// | references: erf, exact, and        | any      | 16x16, a lane per pixel        | channels/ |
-// |   analytic with frame "paper"      |          |                                |           |
+// | kGeneric: erf, exact, and          | any      | 16x16, a lane per pixel        | channels/ |
+// |   analytic, frame_gradient "paper" |          |                                |           |
 // | moment 1                           | any      | 16x16; 8x8 in small images     | moment/   |
 // | moment 4                           | any      | 8x8                            | moment/   |
 // | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |

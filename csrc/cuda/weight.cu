@@ -1,4 +1,4 @@
-// Launches the kernels of weight.cuh for torch/stages.cpp.
+// Launches the kernels of weight.cuh for torch/backend_cuda.cpp.
 #include "core/footprint/registry.h"
 #include "cuda/launch.cuh"
 #include "cuda/weight.cuh"

@@ -1,4 +1,4 @@
-// The contract of a camera model: the map from camera space to pixels, its Jacobian, and the adjoints of both. A model
+// The contract of a camera model: the map from the world to pixels, its Jacobian, and the adjoints of both. A model
 // is a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
 // and defocus.h call the functions. Their arguments are those in pinhole.h and clip_space.h.
 //
@@ -9,8 +9,8 @@
 //
 // The map, after p.view is set:
 //
-//   map(camera, mean, p) -> bool        sets p.pixel, and what the adjoint reads. False before the near plane and
-//                                       outside the field of view
+//   map(camera, mean, p) -> bool        sets p.pixel, and what the adjoint reads. False where the model ends: such a
+//                                       Gaussian is culled
 //   map_vjp(..., dL_dview) -> Vec3      adds to dL_dview; returns dL/dmean of a map that reads `mean`
 //   add_map_vjp
 //

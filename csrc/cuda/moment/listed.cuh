@@ -1,7 +1,7 @@
 // Kernels filter and listed_blend: the forward pass of moment/ for lists that are cut into segments. blend_moment
 // (blend.cu) launches them. `filter` tests every pair of these lists against every pixel of its tile, and writes the
 // bits to reach_words. `listed_blend` reads the bits, lists and splats, and writes what moving_blend writes for other
-// lists.
+// lists, but for checkpoints within the segments after the first, which segment_maps stores.
 //
 // In a small image of a large scene, a tile may have hundreds of thousands of splats, most of them smaller than a
 // pixel. So a pixel composites only splats that reach it. It has a queue of them (queue.cuh), or its warp walks the

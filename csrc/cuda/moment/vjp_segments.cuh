@@ -1,7 +1,7 @@
 // Kernel segment_vjp: the last step of the backward pass of moment/ for lists that are cut. blend_vjp_moment
-// (blend_vjp.cu) launches it after chain_maps. It reads adjoint_maps, checkpoints, `last` and splats, and writes rows
-// of pair_grads and channel_sums. A warp takes a group of pixels back through a segment. Groups are unequal work, so
-// warps claim one after another.
+// (blend_vjp.cu) launches it after chain_maps. It reads the gradient of the image, checkpoints, `last` and splats, and
+// writes rows of pair_grads and channel_sums. A block claims a segment and goes back through it in batches. In each
+// batch its warps claim groups of pixels, which are unequal work. adjoint_maps keeps the Adjoints from batch to batch.
 #pragma once
 
 #include <algorithm>

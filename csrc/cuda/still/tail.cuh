@@ -1,5 +1,5 @@
 // Kernels that finish the tiles that blend_front has left open; front.cuh has an overview, still/blend.cu launches
-// them. They read lists, splats, the plan and `open_tiles`, and write checkpoints, `last` and images.
+// them. They read lists, splats, the plan and `open_tiles`, and write checkpoints, `last`, transmittance and images.
 #pragma once
 
 #include "cuda/launch.cuh"
