@@ -1,9 +1,10 @@
 // A library for all kernels of blending: pixels of a lane, list of a tile, reach of a splat, and splats that a block
 // stages in shared memory.
 //
-// A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one of them, in still/vjp.cuh all. Subtile b is in column b % 2 and row b / 2 of
-// the tile. Lane l has the pixel in column l % 8 and row l / 8 of the subtile. With a Spread
-// (core/footprint/contract.h) a lane has a sample: neighbouring lanes share a pixel, and the tile has fewer pixels.
+// A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one of them, in still/vjp.cuh all.
+// Subtile b is in column b % 2 and row b / 2 of the tile. Lane l has the pixel in column l % 8 and row l / 8 of the
+// subtile. With a Spread (core/footprint/contract.h) a lane has a sample: neighbouring lanes share a pixel, and the
+// tile has fewer pixels.
 #pragma once
 
 #include <type_traits>
