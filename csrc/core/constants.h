@@ -1,4 +1,5 @@
-// Constants that the whole pipeline shares: those of 3DGS, sizes of tiles, and limits that keep float32 finite. The viewer's page has copies, which a test compares.
+// Constants that the whole pipeline shares: those of 3DGS, sizes of tiles, and limits that keep float32 finite. The
+// viewer's page has copies, which a test compares.
 #pragma once
 
 namespace ar {

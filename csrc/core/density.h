@@ -1,5 +1,5 @@
-// Adds one picture to the statistics of density control, per Gaussian: the length of the gradient by means2D, and a view
-// where the radius is above 0. cpu/activations.cpp and cuda/activations.cu call it.
+// Adds one picture to the statistics of density control, per Gaussian: the length of the gradient by means2D, and a
+// view where the radius is above 0. cpu/activations.cpp and cuda/activations.cu call it.
 #pragma once
 
 #include <cmath>

@@ -1,7 +1,7 @@
 // One Gaussian to one splat, and the adjoint: a library for cpu/project.h, cpu/rows.h and cuda/project*.cuh. The camera
 // gives mean, covariance, opacity and depth (project_gaussian), the footprint shape and support (shape_splat), the
-// harmonics colour (splat_color). project_vjp is the adjoint of all three. may_be_visible culls cheaply before them. Public
-// rows and rows of channels are written and read here too.
+// harmonics colour (splat_color). project_vjp is the adjoint of all three. may_be_visible culls cheaply before them.
+// Public rows and rows of channels are written and read here too.
 #pragma once
 
 #include <type_traits>

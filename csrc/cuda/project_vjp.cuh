@@ -1,7 +1,7 @@
-// Kernels of the backward pass beside and after blend_vjp; project.cu launches them. project_vjp takes sums of pairs, or
-// gradients of public rows, to gradients of Gaussians and, for each warp, of the camera. zero_culled_grads, beside
-// blend_vjp, reads only the ranges of pairs, and writes zeros for 32 adjacent Gaussians none of which has pairs. From sums
-// of pairs, row_grads writes gradients of public rows, and sum_channels of channels.
+// Kernels of the backward pass beside and after blend_vjp; project.cu launches them. project_vjp takes sums of pairs,
+// or gradients of public rows, to gradients of Gaussians and, for each warp, of the camera. zero_culled_grads, beside
+// blend_vjp, reads only the ranges of pairs, and writes zeros for 32 adjacent Gaussians none of which has pairs. From
+// sums of pairs, row_grads writes gradients of public rows, and sum_channels of channels.
 #pragma once
 
 #include "cuda/launch.cuh"

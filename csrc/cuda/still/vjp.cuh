@@ -2,8 +2,8 @@
 // launches it. It reads the plan and what vjp_walk.cuh names, and writes rows of pair_grads.
 //
 // A warp goes through a chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp
-// makes the sums of a pair, without atomics, whose order would change from run to run. Only tiles that share the list of
-// a patch add to rows of splats by atomics.
+// makes the sums of a pair, without atomics, whose order would change from run to run. Only tiles that share the list
+// of a patch add to rows of splats by atomics.
 #pragma once
 
 #include "cuda/launch.cuh"
