@@ -138,7 +138,8 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
   }
 }
 
-/// A thread per tile. Atomics hand out indices, whose order changes no result.
+/// A thread per tile writes ChunkPlan, whose shapes chunk_plan.h states. Atomics hand out indices, whose order changes
+/// no result. `samples`: of a lane. `layout`: of checkpoints.
 __global__ void __launch_bounds__(kPlanThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {

@@ -100,6 +100,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
 }
 
+/// A thread per Gaussian. Cam: as above. Writes public rows and radii, or packed rows.
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
@@ -140,6 +141,7 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   if (params.rows.colors) params.rows.colors[i] = splat.color;
 }
 
+/// A thread per public row. Writes a splat and what bin reads.
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
   wait_for_earlier_kernels();
   clear_counts(params);

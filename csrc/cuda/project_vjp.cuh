@@ -237,6 +237,7 @@ __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kF
   }
 }
 
+/// A warp takes kGradRows adjacent Gaussians at a time.
 __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();

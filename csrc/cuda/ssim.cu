@@ -182,7 +182,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
   }
 }
 
-/// One block. block_sums: [blocks, 2].
+/// One block. block_sums: [blocks, 2]. T, Target: as in ssim_kernel.
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
   wait_for_earlier_kernels();

@@ -3,6 +3,9 @@
 // composited. CellLayout says which lane has which samples, MovingSamples is their state, MovingStage a batch of splats
 // in shared memory. MovingBlend composites splats and writes images. Functions that vote, shuffle or wait must be
 // called by all lanes of a warp.
+//
+// Template parameters of all kernels in moment/: F is the footprint, C the number of channels, kSide the side of the
+// tiles [px], Layout a CellLayout, kSegment the pairs of a segment. kKeep: what a backward pass needs is stored.
 #pragma once
 
 #include "cuda/moment/cut_lists.h"

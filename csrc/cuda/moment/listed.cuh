@@ -210,7 +210,7 @@ template <class F, int C, int kSide> union WarpStage {
 };
 
 /// A block has a pixel of one of the longest lists, which come first, or each of its warps a few pixels of another
-/// list. Writes the channels [first, first + C). kKeep: for a backward pass. kSegment: pairs of a segment.
+/// list. Writes the channels [first, first + C) (template parameters: cells.cuh).
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // moving_blend_kernel need not wait for filter_kernel

@@ -61,7 +61,7 @@ using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide,
 
 /// A block has a segment of kSegment pairs and 1 / kBlocks of its tile. Writes the maps of the samples, and the
 /// checkpoints within the segment. The first segment of a list needs no maps, and blend has stored its checkpoints.
-/// Reads the channels [first, first + C).
+/// Reads the channels [first, first + C) (template parameters: cells.cuh).
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
 __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
     segment_maps_kernel(const BlendVjpParams params, int first) {
@@ -120,7 +120,7 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
   Memory(params.adjoint_maps, Layout::first_sample(), Layout::pixel_number()).put(segment.number, m);
 }
 
-/// A thread has a sample; block b has samples of list b / F::kSamples.
+/// A thread has a sample; block b has samples of list b / F::kSamples (template parameters: cells.cuh).
 template <class F, int kSide, int kSegment>
 __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();

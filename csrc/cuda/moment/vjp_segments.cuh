@@ -78,8 +78,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     if (last[i] > k0) map_of(i).put(segment.number, lane.adjoint[i], kCarried);
 }
 
-/// A block claims one segment after another. Reads the channels [first, first + C). `in_shared`: of EarlierPositions,
-/// which follow Shared in memory.
+/// A block claims one segment after another. Reads the channels [first, first + C) (template parameters: cells.cuh).
+/// `in_shared`: of EarlierPositions, which follow Shared in memory.
 template <class F, int C, class Layout, int kSegment>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, true>)
     segment_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {

@@ -155,8 +155,8 @@ struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kState
   }
 };
 
-/// A block per tile whose list is not cut. Reads the channels [first, first + C). `in_shared`: of EarlierPositions,
-/// which follow Shared in memory.
+/// A block per tile whose list is not cut. Reads the channels [first, first + C) (template parameters: cells.cuh).
+/// `in_shared`: of EarlierPositions, which follow Shared in memory.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, false>)
     moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {

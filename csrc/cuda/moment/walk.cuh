@@ -14,7 +14,7 @@ inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / 
 /// Block b has tile plan.tile_order[b], unless its list is cut; the last block only waits
 /// (begin_beside_earlier_kernels). Writes the channels [first, first + C) of the image, and alpha. `beside`:
 /// listed_blend_kernel was launched just before. kKeep: also writes transmittance, `last`, and checkpoints as
-/// TileCheckpoints and MovingSamples lay them out.
+/// TileCheckpoints and MovingSamples lay them out (other template parameters: cells.cuh).
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
