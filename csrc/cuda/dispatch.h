@@ -15,8 +15,9 @@
 // | moment 4                           | any      | 8x8                            | moment/   |
 // | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |
 //
-// still/ blends lists in chunks of 256 pairs. moment/ and channels/ walk whole lists, but moment/ cuts long lists into
-// segments (moment/cut_lists.h).
+// still/ blends lists in chunks of 256 pairs. moment/ and channels/ walk whole lists, but moment/ cuts long lists, or
+// all lists of small images, into segments (moment/cut_lists.h). The .cu files of all families turn footprint and tile
+// side into constants by visit_pixels, visit_lanes and with_tile_side.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Launches the kernels of project.cuh and project_vjp.cuh for torch/backend_cuda.cpp, each for the type of the camera;
-// params.h declares what they read and write.
+// Launches the kernels of project.cuh and project_vjp.cuh for torch/backend_cuda.cpp, where they read a camera for its
+// type; params.h declares what they read and write.
 #include <algorithm>
 #include <mutex>
 #include <set>

@@ -1,6 +1,7 @@
-// Three kernels from Gaussians to splats; project.cu launches them. `project` writes the splats of Gaussians, and what
-// bin reads. `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or to send to
-// another rank. `shape_rows` reads public rows, and writes splats and what bin reads.
+// Three kernels of projection; project.cu launches them. `project` writes the splats of Gaussians, radii, rows of
+// channels, and what bin reads (keys, counts and tiles). `project_rows` writes public rows (mean, covariance, opacity,
+// depth, colour), to keep or to send to another rank. `shape_rows` reads public rows, and writes splats and what bin
+// reads.
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -1,4 +1,5 @@
-// A library for torch/backend_cuda.cpp: a stream for kernels that run beside the caller's stream.
+// A library for torch/backend_cuda.cpp: a stream for kernels that run beside the caller's stream, one per thread
+// and device. It begins after the caller's earlier work. When a SideStream ends, the caller's stream waits for it.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -1,4 +1,5 @@
-// A library for project.cuh: the tiles of a splat, for each of which emit_pairs writes a pair.
+// A library for project.cuh: finds the SplatTiles (mask, first tile, count) of a support. bin writes a
+// pair for each of these tiles.
 #pragma once
 
 #include "core/bin.h"

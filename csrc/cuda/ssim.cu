@@ -1,6 +1,6 @@
 // The similarity of two images, a loss made of it and l1, and the adjoint, for torch/training_cuda.cpp. Three kernels:
 // `ssim` reads images, and writes similarities, partial derivatives and sums of blocks. `loss` adds these sums up in
-// order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
+// a fixed order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
 //
 // A block has a tile of pixels: it copies what windows reach to shared memory, sums along rows, then along columns. A
 // thread makes kSsimRun neighbouring sums from registers, to load less from shared memory.

@@ -2,7 +2,10 @@
 // is a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
 // and defocus.h call the functions. Their arguments are those in pinhole.h and clip_space.h.
 //
-// `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` or p the same point in camera space.
+// The structs that all models share are here too: Camera, FullCamera, ProjectedMean, Jacobian and their gradients.
+//
+// `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` the same point in camera space, p a
+// ProjectedMean.
 // Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
 //
 //   kName                               the name of the model in Python

@@ -1,4 +1,5 @@
-// The list of camera models. A new model is a header and an entry here. camera.h, motion.h and defocus.h visit it.
+// The list of camera models. A new model is a header and an entry here. camera.h, motion.h and defocus.h visit it, and
+// torch/ops.cpp reads the names.
 #pragma once
 
 #include <type_traits>

@@ -1,5 +1,5 @@
-// A library for the footprints that are Gaussians: point, mip, box and moment, and in part cumulant and exact. A
-// Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become
+// A library for the footprints that are Gaussians: point, mip, box and moment, and in part for cumulant, erf and exact.
+// A Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become
 // positive, and does not cancel for long needles as the conic form does (docs/numerics.md, "Whitening").
 #pragma once
 

@@ -1,5 +1,5 @@
 // Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8.
-// channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for reference
+// channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for kGeneric
 // footprints always. A block per tile and group walks the whole list. It reads lists, splats and channels, and writes
 // images, `transmittance` and `last`.
 #pragma once

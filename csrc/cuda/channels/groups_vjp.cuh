@@ -1,7 +1,7 @@
-// Kernel blend_groups_vjp: the backward pass for any number of channels, one group after the other.
-// channels/blend_vjp.cu launches it. A block per tile, a warp per subtile, walks the list back to front; lanes share
-// channels as in groups.cuh. It reads lists, splats, channels, `last`, `transmittance` and gradients of images, and
-// writes pair_grads and channel_sums.
+// Kernel blend_groups_vjp: the backward pass for one group of channels. channels/blend_vjp.cu launches it, once per
+// group; later groups add to pair_grads. A block per tile, a warp per subtile, walks the list back to front; lanes
+// share channels as in groups.cuh. It reads lists, splats, channels, `last`, `transmittance` and gradients of images,
+// and writes pair_grads and channel_sums.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
 // for them the first group makes all sums of shapes, and reads the channels of all groups.

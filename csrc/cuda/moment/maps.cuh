@@ -2,9 +2,9 @@
 // blend_vjp_moment (blend_vjp.cu) launches them before segment_vjp.
 //
 // The Adjoint of a sample goes through a segment as an affine map, so segments can be differentiated side by side.
-// `segment_maps` reads checkpoints, `last`, splats and the gradient of the image. It writes the map of each segment to
-// adjoint_maps, and the checkpoints that blend did not store. `chain_maps` applies the maps from the last segment to
-// the first, and replaces them by what segment_vjp begins with.
+// `segment_maps` reads checkpoints, `last`, splats and the gradient of the image. It writes the map of each segment
+// but the first to adjoint_maps, and the checkpoints that blend did not store. `chain_maps` applies the maps from the
+// last segment to the first, and replaces them by what segment_vjp begins with.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,5 @@
-// Launches the forward kernels of footprints whose samples stay. dispatch.cu calls blend_still().
+// Launches the forward kernels of footprints whose samples stay, for up to four channels. dispatch.cu calls
+// blend_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"
 #include "cuda/still/tail.cuh"

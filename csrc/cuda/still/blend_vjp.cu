@@ -1,4 +1,5 @@
-// Launches the backward kernel of footprints whose samples stay. dispatch.cu calls blend_vjp_still().
+// Launches the backward kernel of footprints whose samples stay, for up to four channels. dispatch.cu calls
+// blend_vjp_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/vjp.cuh"
 
