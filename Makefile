@@ -81,12 +81,12 @@ test-browser: $(VENV)/.installed
 	  echo "no browsers from apt-get: going on without"; fi
 	$(BIN)/python -m pytest -q -n0 -rs $(BROWSER_TESTS) $(BROWSER_OPTIONS)
 
-# Random scenes with bad numbers in them, until one breaks a promise of docs/stability.md.
+# Random scenes with bad numbers in them, until one breaks a promise of docs/reliability.md.
 fuzz: $(VENV)/.installed
 	$(BIN)/python tests/fuzz.py --seconds $(FUZZ_SECONDS)
 
-# Python tests of the extension built under the sanitizers, beside the usual one (docs/process-safety.md): ten minutes
-# to build, ten to run. libasan must come first in a process; libstdc++ with it, or exceptions find no handler.
+# Python tests of the extension built under the sanitizers, beside the usual one (docs/internals/testing.md): ten
+# minutes to build, ten to run. libasan must come first in a process; libstdc++ with it, or exceptions find no handler.
 SANITIZED := $(BUILD)/python-sanitized
 SANITIZED_TESTS ?= tests/test_api.py tests/test_determinism.py tests/test_process.py
 SANITIZED_SELECT ?= not exact and not memory and not instruction_sets and not another_process

@@ -1,6 +1,6 @@
 """The hard cases as data, and how large an error each of them may have.
 
-A case is a scene that breaks textbook formulas, or a camera that does. docs/stability.md has a row for
+A case is a scene that breaks textbook formulas, or a camera that does. docs/internals/testing.md has a row for
 each; tests/test_stability.py renders each with every footprint; benchmarks/stability.py measures.
 
 Tolerances. The rasterizer promises to be as good as its inputs are exact: what it computes in a
@@ -53,10 +53,10 @@ FOCAL = 40.0
 
 @dataclass(frozen=True)
 class Case:
-    """One row of docs/stability.md."""
+    """One row of docs/internals/testing.md."""
 
     name: str
-    row: str  # title in the document
+    title: str
     build: Callable[[], tuple]  # -> (camera, scene in float64)
     layers: int = 0  # splats of a stack: roundings that add up
     round: bool = False  # has splats of equal eigenvalues
