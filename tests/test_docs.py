@@ -7,7 +7,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 DOCUMENTS = sorted(
-    [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("simple_knn/*.md"), *ROOT.glob("third_party/*.md")]
+    [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("simple_knn/*.md"), *ROOT.glob("third_party/*.md")]
 )
 SOURCES = sorted(
     path
