@@ -177,8 +177,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
 
 template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
 
-/// How pixels are spread over warps, as measured: docs/performance-log.md, "`moment`: a queue for each pixel" and
-/// "`moment`: small tiles, and pixels of four warps".
+/// How pixels are spread over warps, as measured: docs/internals/log.md, "The queue" and "Tiles and the longest lists".
 template <class F, int kSide> struct ListedLayouts {
   static constexpr int kWarps = kListedWarps<F>;
   using Longest = AheadLayout<F, kSide, 1, kWarps>;
