@@ -1,4 +1,4 @@
-"""The documents point at what exists: files, headings, and the sections of docs/numerics.md that the code cites."""
+"""The documents point at what exists: files, headings, and the sections of docs that the code cites."""
 
 import pathlib
 import re
@@ -39,12 +39,14 @@ def test_links(document):
         assert not heading or heading in anchors(file), f"{target}: there is no such heading"
 
 
-def test_sections_of_numerics_that_the_code_cites():
-    known = anchors(ROOT / "docs" / "numerics.md")
+def test_sections_that_the_code_cites():
     cited = 0
     for path in SOURCES:
         text = re.sub(r"\n\s*(///?|#)?\s*", " ", path.read_text())  # a citation may be broken over lines of a comment
-        for section in re.findall(r'docs/numerics\.md, "([^"]+)"', text):
-            assert anchor(section) in known, f'{path.relative_to(ROOT)} cites "{section}" of docs/numerics.md'
-            cited += 1
+        for page, sections in re.findall(r'docs/([\w/-]+\.md), ("[^"]+"(?: and "[^"]+")*)', text):
+            document = ROOT / "docs" / page
+            known = anchors(document) | {anchor(bold) for bold in re.findall(r"\*\*(.+?)\*\*", document.read_text())}
+            for section in re.findall(r'"([^"]+)"', sections):
+                assert anchor(section) in known, f'{path.relative_to(ROOT)} cites "{section}" of docs/{page}'
+                cited += 1
     assert cited > 10, "the citations are written in another way: this test reads none of them"
