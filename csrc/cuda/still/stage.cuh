@@ -10,6 +10,7 @@
 namespace ar::cuda {
 
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
+  static_assert(sizeof(TileSplat<F, C>) <= 112, "a splat in use is copied to registers");
   static constexpr int kBatch = kBlendThreads;
   /// Whether lists have offsets in memory, read four at once: only with one sample, where this is much of the work.
   static constexpr bool kOffsets = F::kSamples == 1;

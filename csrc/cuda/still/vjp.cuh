@@ -13,6 +13,7 @@
 namespace ar::cuda {
 
 template <class F, int C> struct VjpShared {
+  static_assert(sizeof(TileSplat<F, C>) <= 112, "a splat in use is copied to registers");
   SharedPixels<F, C> pixels[vjp_warps(F::kSamples)];
   VjpBatch<F, C> batches[vjp_warps(F::kSamples)];
 };
