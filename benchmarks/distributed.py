@@ -49,7 +49,7 @@ from analytic_rasterizer.training.sharded import ShardedTrainer
 from analytic_rasterizer.training.trainer import Trainer
 
 PREDICTED = (4, 8, 64)
-BYTES_OF_A_SPLAT = 84  # forth and back, docs/distributed.md
+BYTES_OF_A_SPLAT = 84  # forth and back, docs/internals/distributed.md
 BLACK = (0.0, 0.0, 0.0)
 COLUMNS = ("seconds", "exchange", "sent", "state_bytes", "peak_bytes")
 
@@ -249,7 +249,7 @@ def pictures_of_noise(views: list[io.View], reduction: float, device: torch.devi
 
 
 def bytes_sent(splats: float, ranks: int) -> float:
-    """Of a rank in a step with a camera per rank, each of which sees so many splats (docs/distributed.md)."""
+    """Of a rank in a step with a camera per rank, each of which sees so many splats (docs/internals/distributed.md)."""
     return BYTES_OF_A_SPLAT * splats * (ranks - 1) / ranks
 
 

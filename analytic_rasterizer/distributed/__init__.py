@@ -1,7 +1,7 @@
 """Gaussians sharded over the ranks of torch.distributed: no rank holds all of them.
 
 `rasterize` renders the cameras of a step, each on the rank that owns it; `rasterize_bands` one camera, each rank a band
-of its rows. docs/distributed.md has the method and how much is sent.
+of its rows. docs/internals/distributed.md has the method and how much is sent.
 """
 
 from .bands import Band, rasterize_bands

@@ -84,9 +84,10 @@ def rasterize_bands(
     many pairs of a tile and a splat as each other; a splat is sent to every rank whose band it touches.
 
     The bands together are the image of one rank with all Gaussians, bit for bit, on CUDA where lists are long and with
-    some footprints to rounding (docs/distributed.md); gradients are the same up to the order in which bands are added
-    up. Differentiable in what `project` is differentiable in, and in the background. Gradients with respect to the
-    camera and the background are on each rank a part: their sum over the ranks is the whole. Waits for the device.
+    some footprints to rounding (docs/internals/distributed.md); gradients are the same up to the order in which bands
+    are added up. Differentiable in what `project` is differentiable in, and in the background. Gradients with respect
+    to the camera and the background are on each rank a part: their sum over the ranks is the whole. Waits for the
+    device.
 
     Args:
         settings: Of the camera, the same on every rank, bit for bit; background and 3D filter as in `rasterize`.

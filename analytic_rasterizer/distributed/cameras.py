@@ -8,7 +8,7 @@ consecutive: global ids count the Gaussians of rank 0 first, then those of rank 
     loss = batch.anchor + sum(loss_of(shown.image, photographs[shown.camera]) for shown in batch.renderings)
     loss.backward()  # on every rank
 
-docs/distributed.md has the method and how much is sent.
+docs/internals/distributed.md has the method and how much is sent.
 """
 
 from __future__ import annotations
