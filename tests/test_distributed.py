@@ -559,7 +559,7 @@ def test_what_is_guessed_of_rows_changes_no_bit(runs, name):
 
 
 def test_as_many_bytes_are_sent_as_the_documentation_says(ran):
-    """docs/internals/distributed.md, "What is sent": per splat 12 numbers forth, 9 back, and 2 for absolute gradients."""
+    """docs/internals/distributed.md, "What is sent": 12 numbers forth, 9 back, 2 for absolute gradients."""
     scenario, made, _, _ = ran
     for place, rank in enumerate(made):
         forth, back = sum(len(ids) for ids in rank["ids"]), sum(len(ids) for ids in rank["gaussian_ids"])
