@@ -46,8 +46,8 @@ PRESETS = {
         finest_repeats=1,
     ),
 }
-"""By name: "quick", the defaults with 7,000 steps, and "3dgs", the recipe of 3DGS. docs/training.md has what each of
-them reaches."""
+"""By name: "quick", the defaults with 7,000 steps, and "3dgs", the recipe of 3DGS. docs/internals/training.md has what
+each of them reaches."""
 
 
 def preset_values(name: str, scales: tuple[int, ...]) -> dict[str, Any]:
