@@ -70,7 +70,7 @@ if WITH_CUDA:
     # Those that take longest begin first, so that no core waits for them at the end.
     slow = ["moment/blend_vjp", "moment/blend", "still/blend", "still/blend_vjp", "project", "channels/blend_vjp"]
     kernels = {str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/**/*.cu")}
-    first = [source for name in slow if (source := f"csrc/cuda/{name}.cu") in kernels]
+    first = [f"csrc/cuda/{name}.cu" for name in slow]
     SOURCES = [*first, *SOURCES, *sorted(kernels - set(first))]
 else:
     SOURCES = [source for source in SOURCES if not source.endswith("_cuda.cpp")]

@@ -222,15 +222,6 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
   return 0;
 }
 
-/// Whether the caller's channels replace colours, or are features beside them.
-template <typename T> AR_HD bool given_colors(const ProjectParams<T>& p) {
-  return p.given.data && !(p.channels.data && p.channels.color >= 0);
-}
-
-template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
-  return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};
-}
-
 template <typename T> AR_HD void write_channels(const ChannelRows<T>& rows, int64_t i, Vec3<T> color, T depth) {
   T* row = rows.data + i * rows.stride;
   if (rows.color >= 0) row[rows.color] = color.x, row[rows.color + 1] = color.y, row[rows.color + 2] = color.z;

@@ -17,7 +17,7 @@
 //
 // still/ blends lists in chunks of 256 pairs. moment/ and channels/ walk whole lists, but moment/ cuts long lists, or
 // all lists of small images, into segments (moment/cut_lists.h). The .cu files of all families turn footprint and tile
-// side into constants by visit_pixels, visit_lanes and with_tile_side.
+// side into constants by visit_lanes and visit_tiles.
 #pragma once
 
 #include <algorithm>
@@ -66,6 +66,22 @@ template <Family kFamily, class Function> void visit_lanes(int footprint, TileGr
     using F = decltype(pixels);
     if constexpr (!F::kMoves && (kFamily == Family::kChannels || !F::kGeneric)) with_lanes<F>(grid, f);
   });
+}
+
+/// Calls f(F{}, side) for a footprint F whose samples move; `side`: of tiles, a constant.
+template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
+  visit_pixels(footprint, [&](auto chosen) {
+    using F = decltype(chosen);
+    if constexpr (F::kMoves) with_tile_side<F>(grid, [&](auto side) { f(chosen, side); });
+  });
+}
+
+/// Channels that still/ and moment/ are compiled for, where there are few.
+constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
+/// Calls f with them as a constant.
+template <class T, class Function> void with_few_channels(const Channels<T>& channels, Function&& f) {
+  if (!channels.data) return f(std::integral_constant<int, compiled_channels(true)>());
+  f(std::integral_constant<int, compiled_channels(false)>());
 }
 
 struct Route {
@@ -125,8 +141,5 @@ inline int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
 inline int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
   return int64_t(cut.max_segments) * kMapNumbers * samples * grid.side() * grid.side();
 }
-
-/// Channels that still/ and moment/ are compiled for.
-constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 
 }  // namespace ar::cuda

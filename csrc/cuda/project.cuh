@@ -87,7 +87,6 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     if (splat.level > 0) {
       if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
         if (params.channels.data) write_channels(params.channels, i, splat.color, depth);
-        if (given_colors(params)) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
       } else {
         radius = 0;
         splat.level = 0;

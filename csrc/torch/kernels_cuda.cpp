@@ -5,7 +5,7 @@
 #include <mutex>
 #include <set>
 #include <string>
-#include <tuple>
+#include <utility>
 #include <vector>
 
 #include "cuda/dispatch.h"

@@ -24,8 +24,8 @@ template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream
   const int64_t most = kFilterBlocksPerSm * multiprocessors();
   const auto blocks = unsigned(cuts_all_lists(p.grid) ? pieces : std::min(pieces, most));
   if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
-  if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);
-  if (p.channels.count <= kFewChannels) return launch_group<F, kFewChannels, kSide>(p, 0, stream);
+  if (p.channels.count <= kFewChannels)
+    return with_few_channels(p.channels, [&](auto channels) { launch_group<F, channels, kSide>(p, 0, stream); });
   for (int first = 0; first < p.channels.count; first += kMovingChannels)
     launch_group<F, kMovingChannels, kSide>(p, first, stream);
 }
@@ -33,12 +33,8 @@ template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream
 }  // namespace
 
 void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream) {
-  visit_pixels(footprint, [&](auto f) {
-    using F = decltype(f);
-    if constexpr (F::kMoves) {
-      with_tile_side<F>(p.grid, [&](auto side) { launch_blend<F, decltype(side)::value>(p, stream); });
-    }
-  });
+  visit_tiles(footprint, p.grid,
+              [&](auto f, auto side) { launch_blend<decltype(f), decltype(side)::value>(p, stream); });
 }
 
 }  // namespace ar::cuda

@@ -27,19 +27,11 @@ template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, 
 
 /// Up to kChannelGroup channels.
 template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
-  if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);
-  if (p.channels.count <= kFewChannels) return launch_group<F, kFewChannels, kSide>(p, 0, stream);
+  if (p.channels.count <= kFewChannels)
+    return with_few_channels(p.channels, [&](auto channels) { launch_group<F, channels, kSide>(p, 0, stream); });
   const int end = std::min(first_of_group + kChannelGroup, p.channels.count);
   for (int first = first_of_group; first < end; first += kMovingChannels)
     launch_group<F, kMovingChannels, kSide>(p, first, stream);
-}
-
-/// Calls f(F{}, side) with the side of the tiles as a constant.
-template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
-  visit_pixels(footprint, [&](auto chosen) {
-    using F = decltype(chosen);
-    if constexpr (F::kMoves) with_tile_side<F>(grid, [&](auto side) { f(chosen, side); });
-  });
 }
 
 }  // namespace

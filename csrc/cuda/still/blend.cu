@@ -27,8 +27,7 @@ template <class F, int C> void launch_blend(const BlendParams& p, cudaStream_t s
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream) {
   visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
     using F = decltype(of_lane);
-    if (!p.channels.data) return launch_blend<F, 3>(p, stream);
-    launch_blend<F, kFewChannels>(p, stream);
+    with_few_channels(p.channels, [&](auto channels) { launch_blend<F, channels>(p, stream); });
   });
 }
 

@@ -21,8 +21,7 @@ template <class F, int C> void launch_blend_vjp(const BlendVjpParams& p, cudaStr
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream) {
   visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
     using F = decltype(of_lane);
-    if (!p.channels.data) return launch_blend_vjp<F, 3>(p, stream);
-    launch_blend_vjp<F, kFewChannels>(p, stream);
+    with_few_channels(p.channels, [&](auto channels) { launch_blend_vjp<F, channels>(p, stream); });
   });
 }
 
