@@ -263,7 +263,7 @@ def footprint_weight(
         TypeError: Wrong or unequal dtypes.
         ValueError: Wrong shape, device, footprint or option.
 
-    Source: point, mip, cumulant, box, exact: docs/numerics.md; analytic, erf: [AS, Eq. 2-9].
+    Source: point, mip, cumulant, box, exact: docs/internals/numerics.md; analytic, erf: [AS, Eq. 2-9].
     """
     spec = resolve_footprint(footprint, **options)
     offset, cov2d = widened(offset), widened(cov2d)  # before they are expanded, which adds gradients up

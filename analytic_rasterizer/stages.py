@@ -161,7 +161,7 @@ def project(
         ValueError: Wrong shape, device or value, or settings that disagree.
         RuntimeError: CUDA tensors, and an extension without CUDA.
 
-    Source: [EWA, Eq. 29-31]; docs/numerics.md.
+    Source: [EWA, Eq. 29-31]; docs/internals/numerics.md.
     """
     # Settings of another class may be a tuple, too: their fields are no cameras.
     several = isinstance(settings, Iterable) and not hasattr(settings, "viewmatrix")

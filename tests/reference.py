@@ -243,7 +243,7 @@ def sample_weights(offset, cov2d, footprint, moved=None, **options):
         xx, xy, yy = cov2d.detach().unbind(-1)
         larger = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
         smallest = torch.sqrt(determinant(cov2d.detach()) / larger).min().item()
-        # Beyond, the weight is below 10.5 exp(-50) (docs/numerics.md, "Support").
+        # Beyond, the weight is below 10.5 exp(-50) (docs/internals/numerics.md, "Support").
         near = quadratic(offset.detach(), add_variance(cov2d.detach(), 1 / 12)) < 100
         value = offset.new_zeros(near.shape)
         if near.any():

@@ -149,7 +149,7 @@ def errors(dtype, offset, cov2d, expected):
 @pytest.mark.parametrize("ratio", RATIOS)
 @pytest.mark.parametrize("sigma", SIGMAS)
 def test_accuracy(sigma, ratio):
-    """The bounds that docs/numerics.md derives, eps = 2^-24 or 2^-53 being one rounding.
+    """The bounds that docs/internals/numerics.md derives, eps = 2^-24 or 2^-53 being one rounding.
 
     Weight: 12 eps (I + |dI/dd| (|d| + 1/2)) <= 12 eps (3 + .74 s1/s2). Gradient, relative to the
     largest: 12 eps (3 + 2 s1/s2). Up to 10 they are within the promised 1e-10 and 5e-5.

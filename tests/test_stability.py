@@ -184,7 +184,7 @@ def test_image_of_16384_x_16384():
 
 
 def weight_in_40_digits(offset, cov2d, footprint, options):
-    """The formulas of docs/numerics.md as they stand there, with mpmath."""
+    """The formulas of docs/internals/numerics.md as they stand there, with mpmath."""
     mp = mpmath.mp
     x, y = offset
     xx, xy, yy = cov2d

@@ -7,7 +7,7 @@
   paper and against the exact integral.
 - footprints: the weight of every footprint and its gradients, over rotations, anisotropies and offsets.
 
-[AS] is the paper with its supplement, see docs/numerics.md.
+[AS] is the paper with its supplement, see docs/internals/numerics.md.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 // Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for boxes of
-// pixels (docs/numerics.md, "Extents of the support"). project.h culls by the extents. cpu/bin.h finds
+// pixels (docs/internals/numerics.md, "Extents of the support"). project.h culls by the extents. cpu/bin.h finds
 // the tiles of a splat, on CUDA `project` does. Blending tests boxes. The keys of the sort by depth are here too.
 #pragma once
 

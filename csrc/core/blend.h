@@ -1,4 +1,4 @@
-// Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
+// Front-to-back compositing of one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its
 // adjoint"). A library for the loops of cpu/ and cuda/. For samples that move, map_placed_sample makes the AdjointMap
 // of a segment. mean_sums_of makes a pixel's part of MeanSums.
 //
@@ -101,7 +101,7 @@ template <class V> struct BlendGrad {
 
 /// Adjoint of blend_sample, called from the last splat to the first.
 ///
-/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of docs/numerics.md) is
+/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of docs/internals/numerics.md) is
 /// that product for all later splats and the background, seen through this splat alone. `transmittance` and `behind`
 /// are read as after the splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
@@ -143,7 +143,7 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                sums.of_splat);
 }
 
-/// How a segment of a list changes `behind` and dL_dplace (docs/numerics.md, "Adjoint of moving nodes").
+/// How a segment of a list changes `behind` and dL_dplace (docs/internals/numerics.md, "Adjoint of moving nodes").
 ///
 ///   behind before = (color + T after * behind after) / T before,
 ///   dL_dplace before = of_color + of_behind * behind after + of_place * dL_dplace after.
@@ -160,7 +160,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // The `s` of docs/numerics.md is of_difference.
+  // The `s` of docs/internals/numerics.md is of_difference.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),

@@ -62,7 +62,7 @@ AR_HD Vec3<T> jacobian_vjp(const Cam& camera, const Jacobian<T>& j, Vec3<T> view
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.jacobian_vjp(camera, j, view, grad); });
 }
 
-/// An upper bound of |W|^2, W the upper left 3x3 of the view (docs/numerics.md, "Culling bound").
+/// An upper bound of |W|^2, W the upper left 3x3 of the view (docs/internals/numerics.md, "Culling bound").
 template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   const Vec3<T> x = xyz(camera.view_x), y = xyz(camera.view_y), z = xyz(camera.view_z);
   const T xy = abs(dot(x, y)), xz = abs(dot(x, z)), yz = abs(dot(y, z));

@@ -37,7 +37,7 @@ inline constexpr double kRadiusMinGap = 0.1;
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 
 /// Added to every level, so that rounding loses no pair, except of needles longer than 280 to 1000 px
-/// (docs/numerics.md, "Support").
+/// (docs/internals/numerics.md, "Support").
 inline constexpr double kLevelSlack = 1e-2;
 
 /// Ten roundings: the margin of a Gaussian's reach.

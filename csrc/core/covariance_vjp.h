@@ -1,5 +1,5 @@
 // The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. The
-// caller is project.h. Every product is formed in coordinates in which its terms do not cancel (docs/numerics.md, from
+// caller is project.h. Every product is formed in coordinates in which its terms do not cancel (docs/internals/numerics.md, from
 // "Gradient in the turned frame" on).
 #pragma once
 
@@ -66,7 +66,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
     const Vec2<T>& b = context.blur.streak;
     const Cov2d<T>& streaked = context.cov.streaked;
     m.c = b.x * ty - b.y * tx;
-    // docs/numerics.md, "Gradient through a blur": e_k = t_k . u.
+    // docs/internals/numerics.md, "Gradient through a blur": e_k = t_k . u.
     const T half = T(0.5) * context.weighted, inv = inverse_root(f.cov.det, streaked.det);
     const Vec3<T> e = inv * (b.x * m.x + b.y * m.y);
     h.diagonal += half * mul(e, e);
@@ -81,7 +81,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.frame == GradFrame::kTriangular) {
-    // "Cholesky factors" of docs/numerics.md, "Gradient in whitened coordinates".
+    // "Cholesky factors" of docs/internals/numerics.md, "Gradient in whitened coordinates".
     const bool x_first = w.xx != T(0);
     const T along = w.xx + w.xy, across = (x_first ? w.yy : w.yx) * along * along;
     qx = along * (x_first ? tx : ty);

@@ -12,7 +12,7 @@
 
 namespace ar {
 
-/// Bounds of a Gaussian's reach with a footprint (docs/numerics.md, "Culling bound").
+/// Bounds of a Gaussian's reach with a footprint (docs/internals/numerics.md, "Culling bound").
 template <typename T> struct CullBounds {
   T variance;  ///< that the footprint adds [px^2]
   T level;     ///< of the support ellipse at opacity 1
@@ -297,7 +297,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   if constexpr (Cam::kFull) {
     const Blur<T> blur = blur_of(camera, mean.view);
     has_blur = blur.any();
-    // A blur of zero has a zero gradient (docs/numerics.md, "Lens and shutter").
+    // A blur of zero has a zero gradient (docs/internals/numerics.md, "Lens and shutter").
     if (has_blur) {
       const BlurContext<Blur<T>, T> context = {blur, blurred(factors, g, i, blur), projected.weighted};
       dL_djacobian = project_covariance_vjp(g, out, i, factors, grad, context);

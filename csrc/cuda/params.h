@@ -238,7 +238,7 @@ void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t s
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
 /// Of the current device, for route_of().
 int multiprocessors_of_device();
-int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid);
+int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid);
 // The families (still/, moment/, channels/).
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);

@@ -225,7 +225,7 @@ class CudaBackend final : public Backend {
     if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
     Tensor group_sums;
-    const int64_t sums = cuda::max_group_sums(pass.footprint.choice.index, count, cut, pass.grid);
+    const int64_t sums = cuda::max_group_sums(pass.footprint.choice.index, p.channels, cut, pass.grid);
     if (sums > 0) group_sums = at::empty({sums}, floats_);
     p.group_sums = pointer<float>(group_sums);
 

@@ -96,7 +96,7 @@ TEST_P(FootprintTest, MassIsConserved) {
       // Without compensation the dilated Gaussian keeps its peak instead.
       const Cov2d<double> mass = f.is("point") ? blur(cov, f.options.number) : cov;
       const double expected = 2 * kPi * std::sqrt(mass.det);
-      // `cumulant` truncates a series: 1/(240000 l^4) of the amplitude (docs/numerics.md) in each of some
+      // `cumulant` truncates a series: 1/(240000 l^4) of the amplitude (docs/internals/numerics.md) in each of some
       // 2 pi 9 s1' s2' pixels, against a mass of 2 pi s1 s2; 6.6% in the limit sigma = 0 (measured).
       const double l = s2 * s2 + kPixelVariance;
       const double truncation =

@@ -1,4 +1,4 @@
-// The window of `analytic`, F of docs/numerics.md, "Logistic window", as a polynomial of each splat.
+// The window of `analytic`, F of docs/internals/numerics.md, "Logistic window", as a polynomial of each splat.
 //
 // The formula takes two exponentials for each axis and pixel. But (F(0)/F(t))^(1/4) is a smooth function of t, which
 // grows from 1 to 4 or less where no opacity can make the splat visible. Let h be half a pixel in standard deviations,

@@ -25,7 +25,7 @@ precision highp usampler2D;
 ${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glslNumber(value)};`).join('\n')}
 `;
 
-// What `analytic` computes once per splat: F(0) of docs/numerics.md, "Logistic window". `r` = 1/sigma [1/px].
+// What `analytic` computes once per splat: F(0) of docs/internals/numerics.md, "Logistic window". `r` = 1/sigma [1/px].
 const WINDOW_TOP = `
 float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
   float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};

@@ -57,7 +57,7 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
       to.lens.tan_half_fov.y += j.ratio_y > camera.lens.center.y ? clamp * by_ratio.y : -clamp * by_ratio.y;
     }
   }
-  /// docs/numerics.md, "Culling bound".
+  /// docs/internals/numerics.md, "Culling bound".
   template <class Cam, typename T> AR_HD static T largest_stretch(const Cam& camera, Vec3<T> view) {
     const Vec2<T> r = largest_ratio(camera);
     return divide(max(camera.focal.x, camera.focal.y), view.z) * approx_sqrt(T(1) + r.x * r.x + r.y * r.y);

@@ -1,6 +1,6 @@
 // The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
 // logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it. The forms are those of
-// docs/numerics.md, "Logistic window".
+// docs/internals/numerics.md, "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -85,7 +85,7 @@ template <class V> struct LogisticValue {
 };
 
 enum class FrameGradient {
-  kFrozen,  ///< of a fixed frame (docs/numerics.md, "Frame gradient")
+  kFrozen,  ///< of a fixed frame (docs/internals/numerics.md, "Frame gradient")
   kPaper,   ///< of the formula [AS, Eq. 10-16]: grows like 1/(l1 - l2)
 };
 
@@ -114,7 +114,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
   AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
-  /// Deviates: [AS, Eq. 2] is 0/0 for some covariances (docs/numerics.md, "Eigenframe").
+  /// Deviates: [AS, Eq. 2] is 0/0 for some covariances (docs/internals/numerics.md, "Eigenframe").
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Eigenframe<T> frame = eigenframe(cov);
     const T s1 = max(frame.sigma.x, T(kMinSigma)), s2 = max(frame.sigma.y, T(kMinSigma));

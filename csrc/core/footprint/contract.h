@@ -1,6 +1,6 @@
 // The contract of a footprint: the model that turns a projected Gaussian into its weight I in a pixel. A footprint F is
 // a struct of static functions and constants, and a line in registry.h; nothing else in csrc names it. Projection and
-// the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/adding-a-footprint.md.
+// the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/internals/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
 // centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
@@ -81,7 +81,7 @@
 
 namespace ar {
 
-/// Projected covariance [px^2]. det comes from factors (docs/numerics.md, "Determinant from factors").
+/// Projected covariance [px^2]. det comes from factors (docs/internals/numerics.md, "Determinant from factors").
 template <typename T> struct Cov2d {
   T xx, xy, yy, det;
 };
@@ -205,7 +205,7 @@ enum class GradFrame {
 
 /// Gradient of one splat: dL = dL_dmean . dmean + tr(dL_dwhite w dSigma w^T) + dL_dlog_amp d(log amp), with amp =
 /// sqrt(det Sigma / det(Sigma + variance I)). It stays in factors until covariance_vjp.h, since products would cancel
-/// (docs/numerics.md, "Gradients").
+/// (docs/internals/numerics.md, "Gradients").
 template <typename T> struct SplatGrad {
   Vec2<T> dL_dmean;
   Mat2<T> w;
@@ -214,7 +214,7 @@ template <typename T> struct SplatGrad {
   GradFrame frame;
 };
 
-/// Gradient of log amp by Sigma, without cancellation (docs/numerics.md, "Gradient of an amplitude").
+/// Gradient of log amp by Sigma, without cancellation (docs/internals/numerics.md, "Gradient of an amplitude").
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
   const T scale = quotient(T(0.5) * v, blur(c, v).det), square = c.xy * c.xy;
   return {scale * quotient(c.yy * (c.yy + v) + square, c.det), -scale * (quotient(c.xy, c.det) * (c.xx + c.yy + v)),

@@ -1,18 +1,18 @@
 // The footprint `cumulant`: the axis-aligned unit pixel through its cumulants, with one exponential, smooth in Sigma
-// and without eigenvectors (docs/numerics.md, "Weights"). registry.h lists it.
+// and without eigenvectors (docs/internals/numerics.md, "Weights"). registry.h lists it.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/numerics.md, "Weights". t is the diagonal
+/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/internals/numerics.md, "Weights". t is the diagonal
 /// entry of the conic. Weights beyond the cap are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // by t
 
-  /// Of `unit` times h, for p and t in coordinates in which the conic is divided by `scale` (docs/numerics.md, "Units
+  /// Of `unit` times h, for p and t in coordinates in which the conic is divided by `scale` (docs/internals/numerics.md, "Units
   /// of the exponent").
   AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
     const T dx = scale * T(kPixelVariance), x = t * dx;
@@ -73,7 +73,7 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
-  /// The tests check this bound (docs/numerics.md, "Support").
+  /// The tests check this bound (docs/internals/numerics.md, "Support").
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     const T a = conic_xx(shape.w), c = conic_yy(shape.w);
     return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);
@@ -94,7 +94,7 @@ struct Cumulant : FootprintDefaults {
     return exp2(t.x.subtract_from(t.y.subtract_from(gaussian, t.y.capped(p.y)), t.x.capped(p.x)));
   }
 
-  /// z + e and the matrix of docs/numerics.md, "Gradients of the weights", to base 2.
+  /// z + e and the matrix of docs/internals/numerics.md, "Gradients of the weights", to base 2.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Lower2<T>& w = t.w;

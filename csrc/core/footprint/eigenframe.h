@@ -12,7 +12,7 @@ template <typename T> struct Eigenframe {
   Vec2<T> axis;
 };
 
-/// Without 0/0 for diagonal covariances and a difference of eigenvalues (docs/numerics.md, "Eigenframe").
+/// Without 0/0 for diagonal covariances and a difference of eigenvalues (docs/internals/numerics.md, "Eigenframe").
 template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
   const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
   const T gap = eigenvalue_gap(cov);

@@ -7,7 +7,7 @@
 namespace ar {
 
 /// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d, by quadrature
-/// with positive weights. docs/numerics.md, "The exact integral", has the rules and error bounds.
+/// with positive weights. docs/internals/numerics.md, "The exact integral", has the rules and error bounds.
 ///
 /// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
 /// `tilt`. The line z.y = 0 is the ridge. A Gaussian that is narrow across the ridge is integrated in strips around the

@@ -1,6 +1,6 @@
 // A library for the footprints that are Gaussians: point, mip, box and moment, and in part for cumulant, erf and exact.
 // A Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become
-// positive, and does not cancel for long needles as the conic form does (docs/numerics.md, "Whitening").
+// positive, and does not cancel for long needles as the conic form does (docs/internals/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -63,7 +63,7 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeG
 /// Of each of the S Gaussians of `box` [px^2].
 template <int S> inline constexpr double kBoxVariance = S == 1 ? kPixelVariance : 1.0 / (24 * S);
 
-/// Node s of `box` [px]. The mixture has the mean and covariance of the pixel (docs/numerics.md, "Nodes").
+/// Node s of `box` [px]. The mixture has the mean and covariance of the pixel (docs/internals/numerics.md, "Nodes").
 template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
   constexpr Vec2<double> kNodes4[] = {{-0.12083, -0.36226}, {0.36226, -0.12083}};
   constexpr Vec2<double> kNodes16[] = {{0.26975, -0.14597}, {0.14427, -0.43939}, {0.06200, -0.14646},

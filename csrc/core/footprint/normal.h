@@ -83,7 +83,7 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   return m;
 }
 
-/// From the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2) (docs/numerics.md, "Gradients of the
+/// From the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2) (docs/internals/numerics.md, "Gradients of the
 /// weights").
 template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, GradFrame frame) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
@@ -91,7 +91,7 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
 }
 
 /// Along one axis, how much the pixel may raise the level of the Gaussian with variance 1/t = sigma^2 + 1/12
-/// (docs/numerics.md, "Support"). The tests check that it falls as t^2.
+/// (docs/internals/numerics.md, "Support"). The tests check that it falls as t^2.
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 }  // namespace ar

@@ -36,18 +36,19 @@ template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int
 
 }  // namespace
 
-int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid) {
+int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid) {
   int64_t numbers = 0;
   if (cut.max_segments == 0) return 0;
   visit_tiles(footprint, grid, [&](auto f, auto side) {
     using F = decltype(f);
     constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
     using Layout = ClaimedLayout<F, kSide>;
-    // Three channels may be rows, whose kernels have kFewChannels.
-    const int64_t of_colors = group_sums_of<F, 3, Layout, kSegment>(cut.max_segments);
-    numbers = channels > kFewChannels
-                  ? group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments)
-                  : std::max(of_colors, group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments));
+    if (channels.count <= kFewChannels)
+      with_few_channels(channels, [&](auto count) {
+        numbers = group_sums_of<F, count, Layout, kSegment>(cut.max_segments);
+      });
+    else
+      numbers = group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
   });
   return numbers;
 }
