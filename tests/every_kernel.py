@@ -131,15 +131,22 @@ def weights(device: str) -> None:
 
 
 def stages(device: str) -> None:
-    """Two cameras in a batch, plain ones and others, each stage by itself."""
-    image = IMAGES["small, opaque"]
-    for effects in (None, ar.Effects(defocus=ar.Defocus(aperture=0.1, focus=3.0))):
-        settings = image.camera().settings(torch.float32, device, footprint="box:samples=1", effects=effects)
+    """Two cameras in a batch, plain ones and others, each stage by itself; three channels in splats and in rows."""
+    image = IMAGES["small"]
+    for footprint, effects in (
+        ("box:samples=1", None),
+        ("box:samples=1", ar.Effects(defocus=ar.Defocus(aperture=0.1, focus=3.0))),
+        ("moment:samples=16", None),
+    ):
+        settings = image.camera().settings(torch.float32, device, footprint=footprint, effects=effects)
         leaves = scenes.leaves(image.scene(device))
         del leaves["means2D"]
         splats = ar.project([settings._replace(sh_degree=3)] * 2, **leaves)
-        for channels in (3, 6):
-            features = None if channels == 3 else torch.rand(len(splats.depths), channels, device=device)
+        for features in (
+            None,
+            torch.rand(len(splats.depths), 3, device=device, requires_grad=True),
+            torch.rand(len(splats.depths), 6, device=device),
+        ):
             ar.blend(splats, ar.list_tiles(splats), features)[0].sum().backward(retain_graph=True)
 
 

@@ -240,6 +240,25 @@ def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
     )
 
 
+@pytest.mark.parametrize("variant", [("moment", {"samples": 4}), ("moment", {"samples": 16})], ids=name_of)
+@each_precision
+def test_three_channels_in_rows_are_as_in_splats(device, dtype, variant):
+    """Lists are so long that kernels cut them into segments; rows of three channels have other sums than colours."""
+    camera = Camera(image_width=20, image_height=15)
+    settings = dataclasses.replace(camera, sh_degree=1).settings(dtype, device, footprint=variant[0], **variant[1])
+    scene = scenes.random_scene(5, 3000, degree=1, opacity=(0.004, 0.05), spread=0.3)
+    scene = scenes.cast({name: value for name, value in scene.items() if name != "means2D"}, dtype, device)
+    g = weights((3, 15, 20), dtype, device, seed=2) - 0.5
+    grads = []
+    for in_rows in (False, True):
+        leaves = scenes.leaves(scene)
+        splats = ar.project(settings, **leaves)
+        image, _ = ar.blend(splats, ar.list_tiles(splats), splats.colors if in_rows else None)
+        (image[0] * g).sum().backward()
+        grads.append({"image": image.detach(), **{name: leaf.grad for name, leaf in leaves.items()}})
+    assert_gradients_close(grads[1], grads[0], dtype)
+
+
 @each_precision
 def test_a_depth_of_minus_zero_is_zero(device, dtype):
     """The caller's depths may have either sign of zero. Both are nearer than all others, and equal to each other."""
