@@ -44,9 +44,8 @@ int64_t max_group_sums(int footprint, const Channels<float>& channels, const Lis
     constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
     using Layout = ClaimedLayout<F, kSide>;
     if (channels.count <= kFewChannels)
-      with_few_channels(channels, [&](auto count) {
-        numbers = group_sums_of<F, count, Layout, kSegment>(cut.max_segments);
-      });
+      with_few_channels(channels,
+                        [&](auto count) { numbers = group_sums_of<F, count, Layout, kSegment>(cut.max_segments); });
     else
       numbers = group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
   });
