@@ -279,7 +279,7 @@ class GaussianRasterizer(LibraryRasterizer):
             (P,) int32, px; 0 for a Gaussian that is culled.
 
         Raises:
-            As `forward`.
+            TypeError, ValueError, RuntimeError: As `forward`.
         """
         check_tensors(None, means3D=means3D)
         if means3D.dim() != 2 or means3D.shape[1] != 3:

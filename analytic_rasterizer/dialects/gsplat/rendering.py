@@ -105,8 +105,8 @@ def rasterization(
             cameras of its own, as many cameras as every other, and gets the images of its cameras from the Gaussians of
             all. There are no leading dimensions then, and colors are shared by the cameras. Every rank has to run the
             backward pass. Without a process group, or with one rank, it changes nothing.
-        sparse_grad, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
-        rolling_shutter, viewmats_rs: Refused unless they ask for nothing.
+        sparse_grad, with_ut, with_eval3d: Refused unless they ask for nothing.
+        radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs: Likewise.
         footprint: See `resolve_footprint`. None: the one that `set_default_footprint` or the environment variable
             ANALYTIC_RASTERIZER_FOOTPRINT chose, or else the filter of rasterize_mode and eps2d.
 
