@@ -7,6 +7,8 @@ import torch
 from . import ops  # noqa: F401  (registers the fake kernels)
 from .footprints import check_device
 
+__all__ = ["activate"]
+
 
 def activate(
     log_scales: torch.Tensor, quats: torch.Tensor, logit_opacities: torch.Tensor

@@ -233,17 +233,25 @@ def is_off_center(settings) -> bool:
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera. Lengths in pixels; the image spans [0, width] x [0, height]."""
+    """A pinhole camera with the size of its picture.
 
-    name: str  # of the picture, without directory and suffix
+    Attributes:
+        name: Of the picture, without directory and suffix.
+        width, height: Size of the picture, px.
+        fx, fy: Focal lengths, px.
+        w2c: (4, 4) float64, world to camera; x right, y down, z forward (OpenCV).
+        cx, cy: Principal point, px, the picture spanning [0, width] x [0, height]; None: its centre.
+        offset: (x, y, z), world units: positions in the world are those of w2c plus this. None: they are the same.
+    """
+
+    name: str
     width: int
     height: int
     fx: float
     fy: float
-    w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
-    cx: float | None = None  # principal point; None is the centre
+    w2c: torch.Tensor
+    cx: float | None = None
     cy: float | None = None
-    # (x, y, z), world units: positions in the world are those of w2c plus this. None: they are the same.
     offset: tuple[float, float, float] | None = None
 
     def __post_init__(self):
@@ -281,14 +289,15 @@ class View:
     def scaled(self, scale: float) -> View:
         """The view with `size(scale)` pixels over the same field of view.
 
-        Raises ValueError for a scale that is not positive and finite.
+        Raises:
+            ValueError: A scale that is not positive and finite.
         """
         if not (math.isfinite(scale) and scale > 0):
             raise ValueError(f"scale must be positive and finite, got {scale}")
         return self.resized(*self.size(scale))
 
     def resized(self, width: int, height: int) -> View:
-        """The view with so many pixels over the same field of view."""
+        """The view with `width` x `height` pixels over the same field of view."""
         x, y = width / self.width, height / self.height
         cx, cy = (c if c is None else c * factor for c, factor in ((self.cx, x), (self.cy, y)))
         return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=cx, cy=cy)
@@ -318,9 +327,14 @@ class View:
     ) -> GaussianRasterizationSettings:
         """Settings that render this view with `size(scale)` pixels over the same field of view.
 
-        `footprint` and `options` are those of GaussianRasterizationSettings; None leaves the
-        default footprint. Raises ValueError for a scale that is not positive, and what the
-        settings raise.
+        Args:
+            scale: Of the picture.
+            background: (r, g, b) in [0, 1].
+            sh_degree, footprint, options: As in `GaussianRasterizationSettings`; no footprint: the default.
+            device: Of the tensors of the settings.
+
+        Raises:
+            ValueError: A scale that is not positive, and what the settings raise.
         """
         view = self.scaled(scale)
         return camera_settings(

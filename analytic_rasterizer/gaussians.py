@@ -25,19 +25,32 @@ class Gaussians(NamedTuple):
 
     These are the numbers of a 3DGS .ply and those that an optimizer changes. `arguments` gives what the rasterizer
     takes. A scale of 0 is the logarithm -inf; opacities of 0 and 1 are the logits -inf and inf.
+
+    Attributes:
+        means: (N, 3) centres, world units.
+        log_scales: (N, 3) natural logarithms of the standard deviations in world units.
+        rotations: (N, 4) quaternions (w, x, y, z) of any length.
+        logit_opacities: (N, 1) logits.
+        shs: (N, K, 3) spherical harmonics, K = (sh_degree + 1)^2.
     """
 
-    means: Tensor  # (N, 3) world units
-    log_scales: Tensor  # (N, 3) natural logarithms of the standard deviations in world units
-    rotations: Tensor  # (N, 4) quaternions (w, x, y, z) of any length
-    logit_opacities: Tensor  # (N, 1)
-    shs: Tensor  # (N, K, 3) spherical harmonics, K = (sh_degree + 1)^2
+    means: Tensor
+    log_scales: Tensor
+    rotations: Tensor
+    logit_opacities: Tensor
+    shs: Tensor
 
     @classmethod
     def from_activated(
         cls, means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, shs: Tensor
     ) -> Gaussians:
-        """Gaussians with these standard deviations (N, 3) in world units and opacities (N, 1) in [0, 1]."""
+        """Gaussians by what the rasterizer takes.
+
+        Args:
+            means, rotations, shs: The fields of the same names.
+            scales: (N, 3) standard deviations, world units.
+            opacities: (N, 1) in [0, 1].
+        """
         return cls(means, scales.log(), rotations, opacities.logit(), shs)
 
     @classmethod
@@ -134,11 +147,11 @@ class Gaussians(NamedTuple):
         return Gaussians(*map(function, self))
 
     def rows(self, index: Tensor | slice) -> Gaussians:
-        """Some of the Gaussians: by a mask (N,), by their numbers, or by a slice."""
+        """Some of the Gaussians: `index` is a mask (N,), their numbers, or a slice."""
         return self.map(lambda field: field[index])
 
     def to(self, device) -> Gaussians:
-        """The same on another device."""
+        """The same on another `device`."""
         return self.map(lambda field: field.to(device))
 
     def leaves(self) -> Gaussians:

@@ -13,6 +13,8 @@ import torch
 from . import ops  # noqa: F401  (registers the fake kernels)
 from .footprints import check_device
 
+__all__ = ["l1_ssim", "ssim"]
+
 REDUCTIONS = ("mean", "none")
 
 

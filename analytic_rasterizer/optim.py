@@ -16,6 +16,8 @@ from . import ops  # noqa: F401  (registers the fake kernels)
 from .checks import check_tensors
 from .footprints import check_device
 
+__all__ = ["FusedAdam", "SparseGaussianAdam", "clear_moments", "replace_rows"]
+
 _adam = torch.ops.analytic_rasterizer.adam_.default
 
 
@@ -89,7 +91,7 @@ class FusedAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def update(self, rows: Tensor | None = None) -> None:
-        """`step` without what torch puts around it for hooks and its profiler, which takes the host as long again.
+        """`step` with `rows`, without what torch puts around it for hooks and its profiler, which takes as long again.
 
         Raises:
             TypeError, ValueError, RuntimeError: As `step`.
@@ -97,7 +99,7 @@ class FusedAdam(torch.optim.Optimizer):
         _update(self, rows, betas=_common(self, "betas"))
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Forgets the gradients, or sets them to zero."""
+        """Forgets the gradients, or sets them to zero where not `set_to_none`."""
         if not set_to_none:
             super().zero_grad(set_to_none=False)
             return
@@ -212,6 +214,7 @@ def clear_moments(optimizer: torch.optim.Optimizer, parameter: Tensor, rows: Ten
     """Sets what the optimiser remembers of the gradients of some rows of a parameter to zero.
 
     Args:
+        optimizer: Any optimiser of torch.
         parameter: (P, ...). What the optimiser has no state for is left alone.
         rows: (P,) bool, (n,) int64, or a slice. By default all.
     """

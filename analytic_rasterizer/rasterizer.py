@@ -53,8 +53,8 @@ def rasterize_gaussians(
 ) -> tuple[torch.Tensor, ...]:
     """Renders Gaussians with `raster_settings`, as a function, in the order of arguments of 3DGS.
 
-    `sh` is `shs` and `cov3Ds_precomp` is `cov3D_precomp` of `GaussianRasterizer.forward`. Shapes, what is returned, and
-    errors are described there.
+    `sh` is `shs` and `cov3Ds_precomp` is `cov3D_precomp`. The other arguments, what is returned and errors are those of
+    `GaussianRasterizer.forward`.
     """
     return render(
         raster_settings,
@@ -145,7 +145,11 @@ def _render_with_outputs(
 
 
 class GaussianRasterizer(torch.nn.Module):
-    """Renders 3D Gaussians with the settings it holds."""
+    """Renders 3D Gaussians with the settings it holds.
+
+    Args:
+        raster_settings: How to render. They may be replaced between two calls.
+    """
 
     def __init__(self, raster_settings: GaussianRasterizationSettings):
         super().__init__()

@@ -55,18 +55,31 @@ class ViewReport:
 
 @dataclass(frozen=True, eq=False)
 class SceneReport:
-    """What `inspect_scene` found: the recommended `effects` and `footprint`, and what the choice is based on."""
+    """What `inspect_scene` found: what it recommends, and what the choice is based on.
 
-    gaussians: int  # of the scene
+    Attributes:
+        gaussians: How many the scene has.
+        sh_degree: Degree of its spherical harmonics.
+        tolerance: RMS in units of colour, as given to `inspect_scene`.
+        machine: On which times were measured.
+        effects: The recommended `Effects`.
+        footprint: The recommended footprint, as `GaussianRasterizationSettings` takes it.
+        findings: What was found about every effect.
+        candidates: The footprints that were tried: name, RMS, whether that fits, and time over that of one sample.
+        views: What every view shows.
+        shown: (P,) bool, on the scene's device: touches a tile of some view. The others change no pixel.
+    """
+
+    gaussians: int
     sh_degree: int
-    tolerance: float  # RMS in units of colour, as given to `inspect_scene`
-    machine: str  # on which times were measured
+    tolerance: float
+    machine: str
     effects: Effects
-    footprint: str  # as `GaussianRasterizationSettings` takes it
-    findings: tuple[Finding, ...]  # one per effect
-    candidates: tuple[Candidate, ...]  # the footprints that were tried
+    footprint: str
+    findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
     views: tuple[ViewReport, ...]
-    shown: torch.Tensor  # (P,) bool, on the scene's device: touches a tile of some view; the others change no pixel
+    shown: torch.Tensor
 
     def to_json(self) -> dict:
         """Everything as numbers, strings, lists and dicts; for the mask `shown` its count."""
@@ -103,10 +116,12 @@ class SceneReport:
         ])  # fmt: skip
 
     def save_picture(self, path) -> None:
-        """Writes a histogram of standard deviations in the image.
+        """Writes a histogram of standard deviations in the image to `path`.
 
-        Raises ImportError without matplotlib, OSError where the file cannot be written, ValueError for a suffix that
-        matplotlib does not know.
+        Raises:
+            ImportError: There is no matplotlib.
+            OSError: The file cannot be written.
+            ValueError: matplotlib does not know the suffix.
         """
         figure, axes = tables.new_figure(7, 3.8)
         ax, occupied = axes[0, 0], [BINS.index(NARROW)]

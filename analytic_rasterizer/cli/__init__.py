@@ -17,7 +17,11 @@ COMMANDS = (train, evaluate, tables, render, view, bake, inspect, errors, pareto
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command and returns its exit code: 0, 2 after an error, 130 when interrupted."""
+    """Runs one command and returns its exit code: 0, 2 after an error, 130 when interrupted.
+
+    Args:
+        argv: The words after the name of the program; None: those of the process.
+    """
     return run_command(lambda: build_parser().parse_args(argv))
 
 

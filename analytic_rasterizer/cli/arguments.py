@@ -34,9 +34,11 @@ class Parser(argparse.ArgumentParser):
     """An ArgumentParser whose errors are one line, and which takes the numbers of a colour as three arguments, too."""
 
     def parse_known_args(self, args=None, namespace=None):
+        """As of ArgumentParser, with `--background R G B` in `args` as one argument; for `namespace` see there."""
         return super().parse_known_args(_with_joined_colors(sys.argv[1:] if args is None else args), namespace)
 
     def error(self, message):
+        """Prints `message` as one line, and ends the process with the exit code 2."""
         if re.fullmatch(r"unrecognized arguments:( [\d.]+)+", message):
             message += "; lists have commas and no spaces: 1,2,4"
         report(f"{message} (see {self.prog} --help)")

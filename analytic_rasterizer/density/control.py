@@ -80,7 +80,7 @@ class FixedDensity:
 
     @torch.no_grad()
     def keep(self, kept: Tensor) -> None:
-        """Takes away all Gaussians but those of the mask (N,) bool. Averages over the others go on."""
+        """Takes away all Gaussians but those of the mask `kept` (N,) bool. Averages over the others go on."""
         self._replace(kept, {name: tensor[:0] for name, tensor in self._tensors().items()})
         for name in self.row_state:
             setattr(self, name, getattr(self, name)[kept])
@@ -102,7 +102,7 @@ class FixedDensity:
         self.observe_gradients(leaf.grad, radii)
 
     def observe_gradients(self, gradients: Tensor, radii: Tensor) -> None:
-        """As `observe`, by the gradients (N, columns) themselves."""
+        """As `observe`, with `radii`, by the `gradients` (N, columns) themselves."""
 
     def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:
         """As `observe`, for a picture whose gradients are known by row.
@@ -140,7 +140,7 @@ class FixedDensity:
         return {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state_dict` gave, with the Gaussians and the optimizer of that moment.
+        """Goes on from the `state` that `state_dict` gave, with the Gaussians and the optimizer of that moment.
 
         Raises:
             ValueError: It is of another number of Gaussians.

@@ -36,7 +36,12 @@ ANTIALIASED = resolve_footprint(COMPENSATED)  # and one that says only that pixe
 
 @dataclass(frozen=True)
 class Choice:
-    """A footprint, and why it was chosen."""
+    """A footprint, and why it was chosen.
+
+    Attributes:
+        footprint: With its options.
+        reason: A clause, such as "scene.ply says so".
+    """
 
     footprint: Footprint
     reason: str
@@ -148,7 +153,7 @@ class FoundScene:
         return [self.trained_view(view) for view in views] if own and trained_size else views
 
     def is_cameras(self, path) -> bool:
-        """Whether a file of views is `cameras`."""
+        """Whether the file of views `path` is `cameras`."""
         return self.cameras is not None and Path(path).samefile(self.cameras)
 
     def training_footprint(self, given: str | Footprint | None = None) -> Choice:

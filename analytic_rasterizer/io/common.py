@@ -10,7 +10,10 @@ from typing import Any
 
 import torch
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+BLACK = (0.0, 0.0, 0.0)
+"""(r, g, b) of a background."""
+WHITE = (1.0, 1.0, 1.0)
+"""(r, g, b) of a background."""
 BACKGROUNDS = {"black": BLACK, "white": WHITE}
 """Backgrounds that have a name."""
 
@@ -61,7 +64,11 @@ def scene_file(path) -> tuple[Path, str]:
 
 
 def optional_import(name: str, extra: str = "cli"):
-    """The module `name`; ImportError naming the extra that installs it when it is missing."""
+    """The module `name`.
+
+    Raises:
+        ImportError: It is missing; the message names the `extra` of this package that installs it.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -70,7 +77,11 @@ def optional_import(name: str, extra: str = "cli"):
 
 
 def to_image(color: torch.Tensor):
-    """A Pillow image of color (3, H, W), or (4, H, W) with alpha: clamped to [0, 1], rounded to 8 bits."""
+    """A Pillow image of `color` (3, H, W), or (4, H, W) with alpha: clamped to [0, 1], rounded to 8 bits.
+
+    Raises:
+        ImportError: Pillow is missing.
+    """
     pixels = color.detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
     return optional_import("PIL.Image").fromarray(pixels.permute(1, 2, 0).contiguous().numpy())
 

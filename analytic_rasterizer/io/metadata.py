@@ -40,8 +40,9 @@ class SceneMetadata:
     def checked(self) -> SceneMetadata:
         """The same as it is written: the footprint with all of its options, and `antialiased` as that footprint is.
 
-        Raises ValueError for an unknown footprint, an offset that is not three finite numbers, and comments that are
-        not single lines of ASCII.
+        Raises:
+            ValueError: An unknown footprint, an offset that is not three finite numbers, or comments that are not
+                single lines of ASCII.
         """
         found = replace(self, comments=tuple(self.comments))
         for comment in found.comments:
@@ -102,12 +103,13 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
 
 
 def read_metadata(path) -> SceneMetadata:
-    """What a file of a scene says beside its Gaussians, which are not read.
+    """What the file `path` of a scene says beside its Gaussians, which are not read.
 
     Warns of lines of this package that it does not understand: they are ignored.
 
-    Raises SceneError, which names the file, where it is not there or unreadable, or has the suffix of no format that
-    `load_scene` reads.
+    Raises:
+        SceneError: The file, which is named, is not there or unreadable, or has the suffix of no format that
+            `load_scene` reads.
     """
     path, kind = scene_file(path)
     if kind == "spz":

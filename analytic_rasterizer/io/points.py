@@ -86,9 +86,11 @@ def read_colors(rows: ply.Rows) -> np.ndarray:
 
 
 def is_scene(path) -> bool:
-    """Whether a file holds Gaussians rather than points: by the properties of a .ply, else by the suffix.
+    """Whether the file `path` holds Gaussians rather than points: by the properties of a .ply, else by the suffix.
 
-    Raises SceneError for a .ply that is none, and OSError.
+    Raises:
+        SceneError: A .ply that is none.
+        OSError: It cannot be read.
     """
     path = Path(path)
     if FORMATS.get(path.suffix.lower(), "ply") != "ply":

@@ -19,6 +19,7 @@ from .writing import write_safely
 BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
+"""Properties that a vertex of a 3DGS .ply must have; harmonics beyond the constant follow as f_rest_0, f_rest_1, ..."""
 HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
 WRITTEN = {".ply": "ply", ".ply_compressed": "compressed", ".spz": "spz", ".splat": "splat"}
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
@@ -147,7 +148,11 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
 
 
 def written_format(path) -> str:
-    """The format that `save_scene` writes under this name: ply, compressed, spz or splat. Else raises SceneError."""
+    """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz" or "splat".
+
+    Raises:
+        SceneError: It writes none under this name.
+    """
     path = Path(path)
     if path.name.lower().endswith(".compressed.ply"):
         return "compressed"

@@ -23,7 +23,7 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
-    """Reads the cameras of a JSON file, in any of three forms:
+    """Reads the cameras of the JSON file `path`, in any of three forms:
 
     - 3DGS `cameras.json`: a list of {id, img_name, width, height, position, rotation, fx, fy} with
       the camera-to-world rotation;
@@ -37,8 +37,9 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
 
     Warns of lens distortion, which is ignored.
 
-    Raises SceneError, naming the file and the entry, for what is missing, malformed, not finite or
-    not positive, and for an empty list.
+    Raises:
+        SceneError: Something is missing, malformed, not finite or not positive, or the list is empty. The message names
+            the file and the entry.
     """
     views, data = read_views(path, size)
     shared = {key: value for key, value in data.items() if key != "frames"} if isinstance(data, dict) else {}
@@ -75,7 +76,11 @@ def distortion_of(entry: dict) -> dict[str, Any]:
 
 
 def save_views(path, views: list[View]) -> None:
-    """Writes views as the plain list of `load_views`. Raises OSError; an earlier file is then unchanged."""
+    """Writes `views` to the file `path`, as the plain list of `load_views`.
+
+    Raises:
+        OSError: It cannot be written. An earlier file is then unchanged.
+    """
     entries = []
     for view in views:
         entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}

@@ -89,19 +89,30 @@ def _reason(error: OSError | RuntimeError, temporary: Path | None) -> str:
 
 
 def write_text(path, text: str) -> None:
-    """Writes text as UTF-8, with the line ends that it has. Raises OSError as `write_safely` does."""
+    """Writes `text` as UTF-8 to the file `path`, with the line ends that it has.
+
+    Raises:
+        OSError: As `write_safely`.
+    """
     write_bytes(path, text.encode())
 
 
 def write_bytes(path, content: bytes) -> None:
-    """Writes bytes. Raises OSError as `write_safely` does."""
+    """Writes the bytes `content` to the file `path`.
+
+    Raises:
+        OSError: As `write_safely`.
+    """
     write_safely(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_json(path, value: Any) -> None:
-    """Writes JSON. Numbers that are not finite, such as the PSNR of a picture without any error, become null.
+    """Writes `value` as JSON to the file `path`.
 
-    Raises OSError as `write_safely` does.
+    Numbers that are not finite, such as the PSNR of a picture without any error, become null.
+
+    Raises:
+        OSError: As `write_safely`.
     """
     write_text(path, json.dumps(as_json(value), indent=1, allow_nan=False) + "\n")
 
@@ -123,7 +134,10 @@ def save_image(path, picture, **options) -> None:
         picture: Colours (3, H, W), which `to_image` makes an image of, or an image of Pillow's.
         options: Those of Pillow's `save`.
 
-    Raises OSError as `write_safely` does, ImportError without Pillow, and ValueError for a suffix of no format.
+    Raises:
+        OSError: As `write_safely`.
+        ImportError: Pillow is missing.
+        ValueError: A suffix of no format.
     """
     image = picture if hasattr(picture, "save") else to_image(picture)
     write_safely(path, lambda temporary: image.save(temporary, **options))

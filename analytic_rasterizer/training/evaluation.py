@@ -37,7 +37,8 @@ def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False
     """LPIPS of two (3, H, W) images in [0, 1], by torchmetrics, whose weights of the network must be there already.
 
     Args:
-        network: One of LPIPS_WEIGHTS.
+        network: "vgg" or "alex".
+        device: Of the images.
         like_3dgs: Hand the network values in [0, 1], as 3DGS's program does, whose numbers papers compare with. The
             network was made for [-1, 1], to which values are scaled otherwise.
 
@@ -75,6 +76,8 @@ def evaluate(
 
     Args:
         scene: On the device of the pictures; of several ranks each has its part.
+        pictures: From `load_pictures`.
+        footprint: To render with.
         lpips: From `load_lpips`; None: left out.
         supersampling: As in `TrainingOptions`.
         ranks: Those that share the scene and the views. All of them get all results.
@@ -143,7 +146,11 @@ def save_pictures(
 ) -> list[Path]:
     """Truth, rendering, and their difference times ERROR_GAIN side by side, for `count` views spread over all.
 
-    Scene and ranks are as in `evaluate`; each rank writes pictures of its own.
+    Args:
+        folder: To write to.
+        count: Of views, at most.
+        scene, pictures, footprint, supersampling, ranks, options: As in `evaluate`. Each rank writes pictures of its
+            own.
 
     Returns:
         The files, FOOTPRINT_SCALE_VIEW.png.

@@ -27,26 +27,42 @@ MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in 
 
 
 class Photograph(NamedTuple):
-    """A camera, and the files of its picture by scale: 1 is always there, and makes the scales that are not."""
+    """A camera, and the files of its picture.
 
-    view: io.View  # without the lens, and of the size of the whole picture
+    Attributes:
+        view: The camera without the lens, and of the size of the whole picture.
+        files: By scale, where 2 is half the size. 1 is always there, and makes the scales that are not.
+        lens: What `load_pictures` removes from the picture; None for a pinhole.
+    """
+
+    view: io.View
     files: dict[int, Path]
-    lens: Lens | None = None  # which `load_pictures` removes from the picture
+    lens: Lens | None = None
 
 
 class Capture(NamedTuple):
-    """What a folder holds."""
+    """What a folder holds.
+
+    Attributes:
+        train, test: The photographs.
+        background: (r, g, b) in [0, 1], by convention, for pictures with alpha.
+        points: Positions and colours in [0, 1], (P, 3) float32 each, on the CPU; None where there are none.
+        offset: (x, y, z), world units: positions in the world are those of views and points plus this. None: they are
+            the same.
+        starts_in_view: Whether random points belong in the views, where there are no others, or in the cube of
+            NeRF-synthetic.
+        masks: How many pictures have a mask, which is ignored.
+        notes: Sentences of what was chosen, for the user.
+    """
 
     train: list[Photograph]
     test: list[Photograph]
-    background: tuple[float, float, float]  # by convention, behind pictures with alpha
-    points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
-    # (x, y, z), world units: positions in the world are those of views and points plus this. None: they are the same.
+    background: tuple[float, float, float]
+    points: tuple[Tensor, Tensor] | None
     offset: tuple[float, float, float] | None = None
-    # Where random points belong if there are no others: in the views, or in the cube of NeRF-synthetic.
     starts_in_view: bool = False
-    masks: int = 0  # of pictures, which are ignored
-    notes: tuple[str, ...] = ()  # sentences of what was chosen, for the user
+    masks: int = 0
+    notes: tuple[str, ...] = ()
 
 
 def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capture:

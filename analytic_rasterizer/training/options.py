@@ -260,7 +260,9 @@ class TrainingOptions:
 
     @classmethod
     def preset(cls, name: str, **given: Any) -> TrainingOptions:
-        """The options of a preset of `PRESETS`: what is `given` wins over the preset, which wins over the defaults.
+        """The options of the preset `name` of `PRESETS`.
+
+        What is `given` wins over the preset, which wins over the defaults.
 
         Raises:
             TypeError: A name in `given` that is no option.
@@ -274,7 +276,11 @@ class TrainingOptions:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingOptions:
-        """The options that `to_dict` gave. Raises ValueError for a name that there is not."""
+        """The options whose `values` `to_dict` gave.
+
+        Raises:
+            ValueError: A name that there is not.
+        """
         unknown = set(values) - {field.name for field in fields(cls)}
         if unknown:
             raise ValueError(f"options must be among those of TrainingOptions, got {', '.join(sorted(unknown))}")

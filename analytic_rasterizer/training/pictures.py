@@ -36,19 +36,28 @@ class Stored(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Views and their pictures, on the device or colours on its host. By scale: 2 is half the size."""
+    """Views and their pictures, on the device or colours on its host. By scale: 2 is half the size.
 
-    views: list[io.View]  # at scale 1
+    Attributes:
+        views: At scale 1.
+        settings: By scale, for every view.
+        colors: By scale, for every view: (3, H, W) uint8, on the background; or (4, H, W) premultiplied, with alpha.
+    """
+
+    views: list[io.View]
     settings: dict[int, list[GaussianRasterizationSettings]]  # made once: they hold tensors
-    colors: dict[int, list[Tensor]]  # (3, H, W) uint8, on the background; or (4, H, W) premultiplied, with alpha
+    colors: dict[int, list[Tensor]]
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
-        """(3, H, W) float32 in [0, 1] on the device; `background` (3,) is for pictures with alpha."""
+        """The picture of a `view` at a `scale`, (3, H, W) float32 in [0, 1] on the device.
+
+        `background` (3,) is for pictures with alpha.
+        """
         color = self._color(scale, view).float() / 255
         return color if background is None else color[:3] + (1 - color[3:]) * background[:, None, None]
 
     def target(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
-        """`truth` as `l1_ssim` takes it: where there is no `background`, (3, H, W) uint8 as stored."""
+        """`truth` of `scale` and `view` as `l1_ssim` takes it: without a `background`, (3, H, W) uint8 as stored."""
         return self._color(scale, view) if background is None else self.truth(scale, view, background)
 
     def _color(self, scale: int, view: int) -> Tensor:
@@ -73,7 +82,10 @@ def load_pictures(
     about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
 
     Args:
-        background: Behind pictures with alpha, 0 to 1; None: keep alpha.
+        items: What `load_capture` found.
+        scales: Whole numbers, 2 for half the size.
+        background: (r, g, b) in [0, 1] for pictures with alpha; None: keep alpha.
+        device: Of the pictures and the settings.
         downsampling: As in `TrainingOptions`.
         on_host: Keep colours in pinned memory of the host, from where each comes when it is asked for.
 

@@ -167,6 +167,7 @@ class Run:
 
     @property
     def progress(self):
+        """Steps taken, and the share of the training that is over."""
         return self.trainer.progress
 
     def train(self, viewer: LiveViewer | None = None) -> bool:

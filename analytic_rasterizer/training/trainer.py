@@ -52,6 +52,7 @@ class Trainer:
     The same seed gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
 
     Args:
+        options: Of the training.
         start: Parameters, on any device; they are copied.
         pictures: To train with; with alpha where the background is random.
         background: Behind the pictures, 0 to 1; None: random.
@@ -110,6 +111,7 @@ class Trainer:
 
     @property
     def gaussians(self) -> Gaussians:
+        """The parameters at present."""
         return self.density.gaussians
 
     @property
@@ -149,7 +151,7 @@ class Trainer:
         return self.options.density != "none" and self.progress.passed(self.density.options.densify_every)
 
     def measure(self, elapsed: float) -> None:
-        """Corrects a training by the clock by its seconds so far: the share that is over, and the times of growth.
+        """Corrects a training by the clock by the seconds `elapsed`: the share that is over, and the times of growth.
 
         In a training by steps nothing changes.
         """
@@ -174,7 +176,7 @@ class Trainer:
         check_visible(self)
 
     def keep(self, kept: Tensor) -> None:
-        """Takes away all Gaussians but those of the mask (P,). Collective."""
+        """Takes away all Gaussians but those of the mask `kept` (P,). Collective."""
         self.density.keep(kept)
         self._rebalance()
         if self.filter_3d is not None:
@@ -354,7 +356,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state_dict` gave."""
+        """Goes on from the `state` that `state_dict` gave."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda field: field.to(self.device, copy=True).requires_grad_())
         for group, field in zip(self.optimizer.param_groups, gaussians):
             group["params"] = [field]
@@ -395,10 +397,13 @@ def make_density(
 def starting_gaussians(
     options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
 ) -> Gaussians:
-    """Gaussians at points (positions and colours (P, 3)), or at random places where there are none. On the CPU.
+    """Gaussians at points, or at random positions where there are none. On the CPU.
 
-    Of more points than `max_gaussians`, so many are drawn by the seed; they keep their order. Random places are in
-    front of the views, see `points_in_view`, or without views in the cube of NeRF-synthetic scenes.
+    Args:
+        options: Of the training. Of more points than its `max_gaussians`, so many are drawn by its seed; they keep
+            their order.
+        points: Positions and colours, (P, 3) each; None: random.
+        views: In whose pictures random positions are; None: in the cube of NeRF-synthetic scenes.
 
     Raises:
         io.SceneError: Fewer than two points.

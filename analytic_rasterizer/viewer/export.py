@@ -16,7 +16,7 @@ MAX_EMBEDDED = 500_000_000
 
 
 def export_page(path, scene: PackedScene) -> int:
-    """Writes the page and the scene into one file, and returns its size in bytes.
+    """Writes the page and the scene into one file, `path`, and returns its size in bytes.
 
     The file loads nothing: its Content-Security-Policy allows the hashes of its own script and style and no connection.
 

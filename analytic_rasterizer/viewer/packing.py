@@ -85,7 +85,8 @@ class PageFootprintError(ValueError):
 def page_footprint(footprint: Footprint) -> str:
     """The footprint as the page writes it, such as `box:samples=4`.
 
-    Raises PageFootprintError for a footprint that the page cannot draw.
+    Raises:
+        PageFootprintError: The page cannot draw it.
     """
     if stated(footprint)["page"] is None:
         known = ", ".join(PAGE_FOOTPRINTS)

@@ -24,7 +24,15 @@ class ViewerServer(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, scene: PackedScene, port: int = 0):
-        """Binds to `port`, or to any free one for 0. Raises OSError where the port cannot be had."""
+        """Binds to a port.
+
+        Args:
+            scene: What `pack_scene` returned.
+            port: 0 takes any free port.
+
+        Raises:
+            OSError: The port cannot be had.
+        """
         super().__init__((ADDRESS, port), _Handler)
         self.token = secrets.token_urlsafe(24)
         self.files = served_files() | {

@@ -16,7 +16,9 @@ from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, res
 from ...settings import one_number, whole_number
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+"""What `rasterization` renders: colours, accumulated depth, expected depth, or both kinds."""
 RASTERIZE_MODES = ("classic", "antialiased")
+"""Filters of `rasterization`, where no footprint was chosen."""
 
 _REFUSED = {
     "sparse_grad": "gradients are dense tensors",

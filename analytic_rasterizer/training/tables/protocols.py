@@ -47,11 +47,13 @@ ROWS = (
     Row("moment", "", {"footprint": RECOMMENDED}),
     Row("moment-filter", "", {"footprint": RECOMMENDED, "filter_3d": True}),
 )
+"""Ways to train, of every table but the starred rows."""
 STARRED_ROWS = tuple(
     Row(f"{row.name}-bicubic", f"{row.published}*" if row.published else "", row.options, bicubic=True)
     for row in ROWS
     if row.name != "3dgs-ss"
 )
+"""The rows whose photographs are reduced with a bicubic kernel."""
 
 
 class Data(NamedTuple):
@@ -69,7 +71,7 @@ class Data(NamedTuple):
     views: str = ""
 
     def find(self, data: Path, scene: str) -> Path | None:
-        """The folder of a scene, or None where there is none."""
+        """The folder of a `scene` in the folder `data`, or None where there is none."""
         known = ("transforms_train.json", "metadata.json", *RECONSTRUCTIONS)
         places = [data / folder / scene for folder in self.folders]
         return next((place for place in places if any((place / name).exists() for name in known)), None)
@@ -108,20 +110,20 @@ class Table(NamedTuple):
     enlarged: int = 1
 
     def training_options(self, row: Row, scene: str) -> dict[str, Any]:
-        """What the row sets among `TrainingOptions` for this scene."""
+        """What the `row` sets among `TrainingOptions` for this `scene`."""
         bicubic = {"scales": (self.data.scenes[scene],), "downsampling": "bicubic"} if row.bicubic else {}
         return self.options | row.options | bicubic
 
     def test_scales(self, row: Row, scene: str) -> tuple[int, ...]:
-        """Reductions of the pictures in `test_images`."""
+        """Reductions of the pictures in `test_images`, for a `row` and a `scene`."""
         return self.training_options(row, scene)["scales"] if row.bicubic else self.scales
 
     def images(self, row: Row, scene: str) -> str:
-        """The folder in the scene whose pictures are trained on."""
+        """The folder in the `scene` whose pictures the `row` trains on."""
         return images_folder(1 if row.bicubic else self.data.scenes[scene])
 
     def test_images(self, row: Row, scene: str) -> str:
-        """The folder in the scene whose pictures are tested."""
+        """The folder in the `scene` whose pictures are tested, for a `row`."""
         return images_folder(self.data.scenes[scene] // self.enlarged) if self.enlarged > 1 else self.images(row, scene)
 
 
@@ -193,3 +195,4 @@ TABLES = {
         ),
     )
 }
+"""The tables, by name."""

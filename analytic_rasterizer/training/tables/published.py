@@ -18,7 +18,12 @@ FOUR_SCALES = ("1", "2", "4", "8")
 
 
 class Number(NamedTuple):
-    """A printed number; `value` is None where it cannot be read."""
+    """A printed number.
+
+    Attributes:
+        value: None where it cannot be read.
+        doubtful: Whether the scan or the paper leaves a doubt.
+    """
 
     value: float | None
     doubtful: bool = False

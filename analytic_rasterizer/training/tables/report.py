@@ -53,20 +53,20 @@ class Results:
 
 
 def text(results: Results) -> str:
-    """All blocks, with what has to be known for reading them."""
+    """The `results` as text: a block per measure and scale, with what has to be known for reading them."""
     blocks = [f"{heading}\n{format_table(header, rows)}" for heading, header, rows in _blocks(results)]
     return "\n\n".join([results.table.title, *blocks, "\n".join(_remarks(results))])
 
 
 def markdown(results: Results) -> str:
-    """The same as Markdown."""
+    """The `results` as Markdown."""
     blocks = [f"## {heading}\n\n{markdown_table(header, rows)}" for heading, header, rows in _blocks(results)]
     remarks = "\n".join(f"- {remark}" for remark in _remarks(results))
     return "\n\n".join([f"# {results.table.title}", *blocks, "## Remarks", remarks]) + "\n"
 
 
 def as_dict(results: Results) -> dict[str, Any]:
-    """What JSON can hold: all that was measured, and all that the paper prints."""
+    """The `results` as JSON can hold them: all that was measured, and all that the paper prints."""
     published = PUBLISHED.get(results.table.name)
     return {
         "table": results.table.name,
