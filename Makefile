@@ -1,6 +1,7 @@
 # make demo: sets up what is needed and renders the demonstration.
 # make test: sets up what is needed and runs every test.
 # make wheel: builds a wheel for the torch of VENV and tries it in a fresh environment.
+# make docs: builds the site of the documents in build/site.
 # Set-up lives in a virtual environment, VENV. Nothing outside it is touched, except that on Debian as root
 # missing build tools are installed with apt-get.
 
@@ -23,7 +24,7 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-architectures test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
+.PHONY: demo test test-architectures test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel docs format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
@@ -124,6 +125,13 @@ wheel: $(VENV)/.torch
 	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$($(BIN)/python -c 'import torch; print("torch==" + torch.__version__.split("+")[0])')" dist/*.whl
 	cd $(BUILD) && $(abspath $(WHEEL_VENV))/bin/python $(CURDIR)/examples/first_picture.py
 
+# Strict: a dead link, a missing anchor or a name of the reference that is not there is an error. The docstrings are
+# read, not imported: neither torch nor a compiler is needed. (With --quiet nothing would be strict.)
+SITE ?= $(BUILD)/site
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(abspath $(SITE))
+	@echo "$(SITE)/index.html"
+
 format: $(VENV)/.tools
 	$(BIN)/clang-format -i $(CPP_SOURCES)
 	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
@@ -143,6 +151,10 @@ $(VENV)/.tools: $(VENV)/.venv
 	command -v cmake > /dev/null || $(BIN)/python -m pip install --quiet cmake
 	@if command -v apt-get > /dev/null && [ "$$(id -u)" = 0 ] && ! [ -e /usr/include/gtest/gtest.h ]; then \
 	  apt-get update -qq && apt-get install -y -qq g++ libgtest-dev > /dev/null; fi
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.venv pyproject.toml
+	$(BIN)/python -m pip install --quiet "pip>=25.1" && $(BIN)/python -m pip install --quiet --group docs
 	touch $@
 
 $(VENV)/.torch: $(VENV)/.venv

@@ -30,7 +30,8 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    source = pathlib.Path(page.file.abs_src_path)
+    folder, name = os.path.split(page.file.abs_src_path)
+    source = pathlib.Path(os.path.realpath(folder), name)
     return as_python_markdown(with_links(markdown, source, page.file.src_uri, config.extra["repository"]))
 
 
@@ -42,7 +43,7 @@ def with_links(markdown, source, page, repository):
         if re.match(r"[a-z]+:|#", target):
             return match[0]
         path, _, heading = target.partition("#")
-        file = (source.parent / path).resolve()
+        file = pathlib.Path(os.path.normpath(source.parent / path))
         if not file.exists():
             log.warning(f"{source.relative_to(ROOT)}: link to {target}, which does not exist")
             return match[0]
@@ -53,11 +54,13 @@ def with_links(markdown, source, page, repository):
             return f"{image}[{text}]({shown}{'#' + heading if heading else ''})"
         if repository and not image:
             return f"[{text}]({repository.rstrip('/')}/{name}{'#' + heading if heading else ''})"
-        plain = text.strip("`")
+        plain = text.strip("`/")
         return f"`{name}`" if plain in (name, path, file.name) else f"{text} (`{name}`)"
 
     pieces = FENCED.split(markdown)  # of which every second one is fenced code
-    pieces[::2] = [LINK.sub(lambda match: replace(match) if match["target"] else match[0], text) for text in pieces[::2]]
+    pieces[::2] = [
+        LINK.sub(lambda match: replace(match) if match["target"] else match[0], text) for text in pieces[::2]
+    ]
     return "".join(pieces)
 
 
