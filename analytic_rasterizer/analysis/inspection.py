@@ -55,15 +55,15 @@ class ViewReport:
 
 @dataclass(frozen=True, eq=False)
 class SceneReport:
-    """What `inspect_scene` found: what it recommends, and what the choice is based on.
+    """What `inspect_scene` found: the cheapest effects and footprint, and what the choice is based on.
 
     Attributes:
         gaussians: How many the scene has.
         sh_degree: Degree of its spherical harmonics.
         tolerance: RMS in units of colour, as given to `inspect_scene`.
         machine: On which times were measured.
-        effects: The recommended `Effects`.
-        footprint: The recommended footprint, as `GaussianRasterizationSettings` takes it.
+        effects: The cheapest `Effects` within the tolerance.
+        footprint: The cheapest footprint within the tolerance, as `GaussianRasterizationSettings` takes it.
         findings: What was found about every effect.
         candidates: The footprints that were tried: name, RMS, whether that fits, and time over that of one sample.
         views: What every view shows.
