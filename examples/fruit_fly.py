@@ -183,6 +183,26 @@ def draw_sheet(rows: list[Row]):
     return sheet
 
 
+def compare(photographs: Photographs, out: Path, steps: int, limit: int) -> None:
+    """Trains, measures and draws; `limit` is the most Gaussians."""
+    point = train(photographs, TRAINED, steps, limit)
+    cameras = [view.settings() for i, view in enumerate(photographs.views) if i % TEST_EVERY]
+    parts = ar.bake_dilation(point.means, point.scales, point.rotations, point.opacities, cameras)
+    baked = point.with_activated(*parts)
+    moment = train(photographs, RECOMMENDED, steps, limit)
+    rows = [Row("the mesh,\nrendered by\nMuJoCo", photographs.pictures[0], {})]
+    for name, title, scene, footprint in (
+        ("point", "trained and\ndrawn with\npoint (3DGS)", point, TRAINED),
+        ("baked", "the same scene\nbaked, drawn\nwith moment", baked, RECOMMENDED),
+        ("moment", "trained and\ndrawn with\nmoment", moment, RECOMMENDED),
+    ):
+        io.save_scene(out / f"fruit_fly_{name}.ply", scene, io.SceneMetadata(footprint))
+        rows.append(measure(title, scene, footprint, photographs))
+        print(name, scene.count, rows[-1].psnr)
+    io.write_json(out / "fruit_fly.json", {row.title: row.psnr for row in rows[1:]})
+    io.save_image(out / "fruit_fly.png", draw_sheet(rows).quantize(256), optimize=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out"))
@@ -192,23 +212,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=60_000, metavar="N", help="at most")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    photographs = photograph(args.views, args.size)
-    point = train(photographs, TRAINED, args.steps, args.gaussians)
-    cameras = [view.settings() for i, view in enumerate(photographs.views) if i % TEST_EVERY]
-    parts = ar.bake_dilation(point.means, point.scales, point.rotations, point.opacities, cameras)
-    baked = point.with_activated(*parts)
-    moment = train(photographs, RECOMMENDED, args.steps, args.gaussians)
-    rows = [Row("the mesh,\nrendered by\nMuJoCo", photographs.pictures[0], {})]
-    for name, title, scene, footprint in (
-        ("point", "trained and\ndrawn with\npoint (3DGS)", point, TRAINED),
-        ("baked", "the same scene\nbaked, drawn\nwith moment", baked, RECOMMENDED),
-        ("moment", "trained and\ndrawn with\nmoment", moment, RECOMMENDED),
-    ):
-        io.save_scene(args.out / f"fruit_fly_{name}.ply", scene, io.SceneMetadata(footprint))
-        rows.append(measure(title, scene, footprint, photographs))
-        print(name, scene.count, rows[-1].psnr)
-    io.write_json(args.out / "fruit_fly.json", {row.title: row.psnr for row in rows[1:]})
-    io.save_image(args.out / "fruit_fly.png", draw_sheet(rows).quantize(256), optimize=True)
+    compare(photograph(args.views, args.size), args.out, args.steps, args.gaussians)
 
 
 if __name__ == "__main__":

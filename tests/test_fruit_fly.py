@@ -1,0 +1,34 @@
+"""What examples/fruit_fly.py does with its pictures, on pictures of a few Gaussians: it needs no MuJoCo."""
+
+import json
+
+import torch
+from torch.nn.functional import avg_pool2d
+
+import analytic_rasterizer as ar
+import fruit_fly
+from analytic_rasterizer import io
+
+
+def test_training_and_sheet(tmp_path):
+    size = 64
+    points = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    truth = ar.Gaussians.from_points(points, points.sigmoid(), opacity=0.9, scale=0.3)
+    views, pictures = [], []
+    for i in range(4):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[2, 3] = 2 + 0.1 * i
+        views.append(ar.View(f"{i}", size, size, 60.0, 60.0, pose))
+        picture = fruit_fly.render(truth, views[-1], 1, "box:samples=16")
+        pictures.append({n: avg_pool2d(picture, n) for n in fruit_fly.REDUCTIONS})
+    fruit_fly.compare(fruit_fly.Photographs(views, pictures, points), tmp_path, steps=30, limit=100)
+    measured = json.loads((tmp_path / "fruit_fly.json").read_text())
+    assert len(measured) == 3 and all(set(scores) == {"1", "2", "4", "8"} for scores in measured.values())
+    assert io.load_scene(tmp_path / "fruit_fly_moment.ply").count == 40
+    with io.optional_import("PIL.Image").open(tmp_path / "fruit_fly.png") as sheet:
+        assert sheet.width == 994
+
+
+def test_directions_are_spread():
+    azimuths, elevations = zip(*fruit_fly.directions(50))
+    assert len(set(azimuths)) == 50 and min(elevations) > -75 and max(elevations) < 20
