@@ -39,18 +39,24 @@ class Docstrings(griffe.Extension):
                         entry.annotation = _annotation(described, entry.name.partition(", ")[0])
 
     def _linked(self, match, described):
-        """A name of the class that is described, or of the package, with its link."""
+        """A name of the class that is described, of its package, or of the library, with its link."""
         first, *others = match[1].split(".")
         around = described if described.is_class else described.parent
         if not others and around is not None and around.is_class and _is_described(around, first):
             same = described is around.members[first]
             return match[0] if same else f"[{match[0]}][{around.path}.{first}]"
-        if first not in self.package.exports or described.path.endswith(f".{first}"):
+        if described.path.endswith(f".{first}"):
             return match[0]
-        found = f"{self.package.path}.{first}"
-        if len(others) == 1 and _is_described(self.package[first], others[0]):
-            found += f".{others[0]}"
-        return f"[{match[0]}][{found}]"
+        module = described if described.is_module else described.module
+        while module is not None:
+            shown = module.is_package or module.name in self.package.exports
+            if shown and first in (module.exports or ()):
+                found = f"{module.path}.{first}"
+                if len(others) == 1 and _is_described(module[first], others[0]):
+                    found += f".{others[0]}"
+                return f"[{match[0]}][{found}]"
+            module = module.parent
+        return match[0]
 
 
 def _is_described(parent, name):
