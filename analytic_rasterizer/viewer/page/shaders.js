@@ -53,7 +53,7 @@ void readWindow(inout vec2 axis, out float flatTop, out vec4 c) {
 }
 `;
 // By pairs of powers: one operation more than Horner's rule, but a chain of five that wait for one another instead of
-// nine. Software renderers draw this form faster (docs/viewer.md).
+// nine. Software renderers draw this form faster (docs/internals/viewer.md).
 const WINDOW_POLYNOMIAL = `
 float windowV(float s, vec4 c) {
   float square = s * s;
