@@ -2,7 +2,7 @@
 
     python benchmarks/footprint_figure.py [--out docs/images/footprints.png]
 
-All weights and all pixels in the picture are computed by the library. Needs `pip install ".[analysis]"`.
+All weights and shares in the picture are computed by the library. Needs `pip install ".[analysis]"`.
 """
 
 from __future__ import annotations
@@ -87,7 +87,10 @@ def shares(footprint: str, fine: int = 1) -> torch.Tensor:
 
 
 def moved_nodes() -> tuple[torch.Tensor, torch.Tensor]:
-    """(4, 2) samples of `moment` before and after the near splat, px (docs/internals/numerics.md, "Moving nodes")."""
+    """(4, 2) positions of the samples of `moment` before and after the near splat, px.
+
+    Source: docs/internals/numerics.md, "Moving nodes".
+    """
     rest = torch.tensor([[x, y] for y in (-0.25, 0.25) for x in (-0.25, 0.25)], dtype=torch.float64)
     variance = stated(ar.resolve_footprint("moment:samples=4"))["variance"]
     narrow, wide = (matrix(covariance(extra)) for extra in (0.0, variance))
@@ -116,7 +119,7 @@ def splat_picture(count: int, footprint: str = UNFILTERED) -> torch.Tensor:
 
 def draw_pixel(axes, kind: str, footprint: str) -> None:
     """What stands for the pixel, in ink."""
-    half = 0.5 * torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], dtype=torch.float64)
+    half = 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     style = {"color": INK, "linewidth": 2.2}
     axes.plot(*half.T, color=INK, linewidth=1.0, linestyle=(0, (2, 2)))
     if kind == "square":
@@ -124,24 +127,24 @@ def draw_pixel(axes, kind: str, footprint: str) -> None:
         axes.fill(*half.T, color=INK, alpha=0.12, linewidth=0)
     elif kind == "turned":
         cos, sin = math.cos(TURN), math.sin(TURN)
-        turned = half @ torch.tensor([[cos, sin], [-sin, cos]], dtype=torch.float64)
+        turned = half @ np.array([[cos, sin], [-sin, cos]])
         axes.plot(*turned.T, **style)
         axes.fill(*turned.T, color=INK, alpha=0.12, linewidth=0)
     elif kind == "dot":
         axes.plot(0, 0, "o", color=INK, markersize=8)
     elif kind == "window":  # the weight of a speck at every position is the weight that the pixel has there
         speck = torch.tensor([1e-6, 0.0, 1e-6], dtype=torch.float64)
-        window = ar.footprint_weight(-grid(), speck, footprint)
+        window = ar.footprint_weight(-grid(), speck, footprint).numpy()
         window = window / window.max()
         axes.contourf(window, levels=[0.135, 0.607, 2], colors=[INK], alpha=0.16, extent=EXTENT, origin="lower")
         axes.contourf(window, levels=[0.607, 2], colors=[INK], alpha=0.3, extent=EXTENT, origin="lower")
         axes.contour(window, levels=[0.607], colors=[INK], linewidths=1.6, extent=EXTENT, origin="lower")
     else:
-        rest, moved = moved_nodes()
+        rest, moved = (nodes.numpy() for nodes in moved_nodes())
         axes.plot([-0.5, 0.5], [0, 0], [0, 0], [-0.5, 0.5], color=INK, linewidth=1.0, linestyle=(0, (2, 2)))
         radius = stated(ar.resolve_footprint(footprint))["variance"] ** 0.5
-        circle = torch.linspace(0, 2 * math.pi, 60, dtype=torch.float64)
-        circle = radius * torch.stack([circle.cos(), circle.sin()], 1)
+        angle = np.linspace(0, 2 * math.pi, 60)
+        circle = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
         for start, end in zip(rest, moved):
             axes.fill(*(end + circle).T, color=INK, alpha=0.3, linewidth=0)
             axes.plot(*(end + circle).T, color=INK, linewidth=1.6)
@@ -158,7 +161,7 @@ def draw_bar(axes, parts: list[float], truth: list[float]) -> None:
                   fontweight="bold")  # fmt: skip
         left += part
     axes.barh(0, 1 - left, left=left, height=1, color=LIGHT)
-    for end in torch.tensor(truth).cumsum(0).tolist():
+    for end in np.cumsum(truth):
         axes.plot([end, end], [-0.75, 0.75], color=INK, linewidth=1.6)
     axes.set(xlim=(-0.01, 1.01), ylim=(-0.8, 0.8))
     axes.axis("off")
@@ -194,7 +197,7 @@ def draw(path) -> None:
             truth = truth or parts
             axes = figure.add_axes((left, top - 0.12 - SIDE * WIDTH / HEIGHT, SIDE, SIDE * WIDTH / HEIGHT))
             shown = "point" if footprint == "point" else UNFILTERED
-            axes.imshow(splat_picture(count, shown), extent=EXTENT, origin="lower", interpolation="bilinear")
+            axes.imshow(splat_picture(count, shown).numpy(), extent=EXTENT, origin="lower", interpolation="bilinear")
             draw_pixel(axes, kind, footprint)
             axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:][::-1], xticks=[], yticks=[])
             for spine in axes.spines.values():
