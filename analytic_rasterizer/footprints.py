@@ -38,7 +38,7 @@ TURNED = "erf"  # the window of PAPER with the exact CDF
 
 ADVICE = {
     "a new training": f"`{RECOMMENDED}`",
-    "a scene that 3DGS trained": f"`bake` it, then `{RECOMMENDED}`; untouched: `{DILATED}`",
+    "a scene that 3DGS trained": f"`bake` it, then `{RECOMMENDED}` (untouched: `{DILATED}`)",
     "speed": f"`{FASTEST}`",
     "parity with the paper": f"`{PAPER}`, the default",
 }
