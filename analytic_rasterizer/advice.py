@@ -19,8 +19,8 @@ TEXT = (
     f"no footprint was chosen, so this renders with the default, {PAPER}, for parity with the paper of "
     "Analytic-Splatting. A model that was trained with 3DGS's own rasterizer looks right untouched with "
     f"{DILATED}: set {ENVIRONMENT_VARIABLE}={DILATED}, or footprint='{DILATED}' in the settings. Better: bake it "
-    f"(python -m analytic_rasterizer bake), then take {RECOMMENDED}. (Choosing {PAPER} changes nothing but this warning. "
-    "See docs/footprints.md.)"
+    f"(python -m analytic_rasterizer bake), then take {RECOMMENDED}. (Choosing {PAPER} changes nothing but this "
+    "warning. See docs/footprints.md.)"
 )
 
 is_due = True
