@@ -12,14 +12,15 @@ import warnings
 import torch
 
 from . import _C
-from .footprints import chosen_footprint
+from .footprints import DILATED, ENVIRONMENT_VARIABLE, PAPER, RECOMMENDED, chosen_footprint
 from .settings import GaussianRasterizationSettings
 
 TEXT = (
-    "no footprint was chosen, so this renders with the default, analytic, for parity with the paper of "
-    "Analytic-Splatting. A model that was trained with 3DGS's own rasterizer looks right with point: set "
-    "ANALYTIC_RASTERIZER_FOOTPRINT=point, or footprint='point' in the settings. (Choosing analytic changes nothing but "
-    "this warning. See docs/footprints.md.)"
+    f"no footprint was chosen, so this renders with the default, {PAPER}, for parity with the paper of "
+    "Analytic-Splatting. A model that was trained with 3DGS's own rasterizer looks right untouched with "
+    f"{DILATED}: set {ENVIRONMENT_VARIABLE}={DILATED}, or footprint='{DILATED}' in the settings. Better: bake it "
+    f"(python -m analytic_rasterizer bake), then take {RECOMMENDED}. (Choosing {PAPER} changes nothing but this "
+    "warning. See docs/footprints.md.)"
 )
 
 is_due = True

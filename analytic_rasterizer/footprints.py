@@ -36,6 +36,15 @@ EXACT = "exact"  # the weight without an error
 NEAREST_TO_EXACT = "cumulant"  # of the footprints with one weight for a splat and a pixel
 TURNED = "erf"  # the window of PAPER with the exact CDF
 
+ADVICE = {
+    "a new training": f"`{RECOMMENDED}`",
+    "a scene that 3DGS trained": f"`bake` it, then `{RECOMMENDED}` (untouched: `{DILATED}`)",
+    "speed": f"`{FASTEST}`",
+    "parity with the paper": f"`{PAPER}`, the default",
+}
+"""Which footprint to take where. README.md, docs and messages have these words (tests/test_docs.py)."""
+ADVICE_IN_WORDS = "; ".join(f"{where}: {which}" for where, which in ADVICE.items()).replace("`", "")
+
 REFERENCE_FOOTPRINTS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["reference"])
 """Footprints that are meant to compare others with, and are slow."""
 
@@ -187,8 +196,8 @@ def set_default_footprint(name: str | Footprint | None, **options: Any) -> None:
     """Chooses the footprint of settings that name none, for the whole process.
 
     `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else to the filter of the dialect that
-    the settings are of (docs/dialects.md), or else to `analytic`, for parity with the paper. Scenes that 3DGS trained
-    look right with `point`, or baked (`bake_dilation`) with `moment`; for a new training take `moment` with 4 samples.
+    the settings are of (docs/dialects.md), or else to `analytic`, for parity with the paper. `footprints.ADVICE` says
+    which footprint to take.
 
     Raises:
         ValueError: As `resolve_footprint()`; or options of no footprint.
@@ -247,7 +256,7 @@ def footprint_weight(
 
     For `box` and `moment` the weight is the mean over the samples; in an image each sample is composited
     on its own, which the mean of the weights does not show. Those of `moment` are at rest here: in an image
-    the splats in front move them.
+    nearer splats move them.
 
     Args:
         offset: (..., 2) pixel centre minus projected mean, px; float32 or float64.

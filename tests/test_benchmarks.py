@@ -56,6 +56,19 @@ def test_effects(device, small_scene, monkeypatch, capsys):
             assert min(result[side]["forward"], result[side]["forward_backward"]) > 0
 
 
+def test_footprint_figure(tmp_path, monkeypatch):
+    """It is drawn, and what it draws of moving samples is what the library blends (the program compares)."""
+    pytest.importorskip("matplotlib", reason="needs the analysis extra")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    figure = importlib.import_module("footprint_figure")
+    monkeypatch.setattr(sys, "argv", ["footprint_figure.py", "--out", str(tmp_path / "out.png")])
+    figure.main()
+    assert 10_000 < (tmp_path / "out.png").stat().st_size < 150_000
+    moment, one_weight = map(figure.shares, ("moment:samples=4", "exact"))
+    truth = figure.shares(figure.UNFILTERED, figure.FINE)
+    assert (moment - truth).abs().max() < 0.02 < (one_weight - truth).abs().max()
+
+
 def test_dialects(monkeypatch, capsys):
     """A row for every dialect, and both calls of each make the same images."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

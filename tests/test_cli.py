@@ -356,7 +356,7 @@ def test_inspect_prints_the_report_and_writes_its_files(files, capsys):
     extra = ["--json", out / "report.json", "--picture", out / "report.png", "--scales", "0.5", "--tolerance", "0.01"]
     assert cli.main(inspect_arguments(files, *extra, "--training-views", files / "views.json")) == 0
     text, report = capsys.readouterr().out, json.loads((out / "report.json").read_text())
-    assert f"recommended: footprint {report['recommendation']['footprint']}" in text
+    assert f"cheapest within the tolerance: footprint {report['recommendation']['footprint']}" in text
     assert report["tolerance"] == 0.01
     assert [(view["name"], view["width"], view["height"]) for view in report["views"]] == [
         ("front", 128, 96),

@@ -1,9 +1,16 @@
-"""The documents point at what exists: files, headings, and the sections of docs that the code cites."""
+"""The documents point at what exists: files, headings, and the sections of docs that the code cites.
+
+They and the messages of the package recommend the same footprints.
+"""
 
 import pathlib
 import re
 
 import pytest
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import advice, cli, footprints
+from analytic_rasterizer.training.options import TrainingOptions
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 DOCUMENTS = sorted(
@@ -50,3 +57,24 @@ def test_sections_that_the_code_cites():
                 assert anchor(section) in known, f'{path.relative_to(ROOT)} cites "{section}" of docs/{page}'
                 cited += 1
     assert cited > 10, "the citations are written in another way: this test reads none of them"
+
+
+def words(text):
+    return " ".join(text.split())
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/footprints.md"])
+def test_pages_recommend_one_footprint(page):
+    """The rows of the table of footprints are those of the code."""
+    text = (ROOT / page).read_text()
+    for where, which in footprints.ADVICE.items():
+        assert f"\n| {where} | {which} |" in text, f"{page} should say: {where}: {which}"
+
+
+@pytest.mark.usefixtures("nothing_chosen")
+def test_messages_recommend_the_same_footprint():
+    for footprint in (footprints.PAPER, footprints.DILATED, footprints.RECOMMENDED):
+        assert footprint in advice.TEXT
+    assert footprints.ADVICE_IN_WORDS in words(cli.build_parser().format_help())
+    assert TrainingOptions().footprint == footprints.RECOMMENDED
+    assert ar.get_default_footprint().name == footprints.PAPER

@@ -222,7 +222,7 @@ def test_report_in_words_and_json(device):
     views = [io.View("a", 64, 48, 60.0, 60.0, CAMERAS[0].world_to_camera()), settings(device)[1]]
     found = ar.inspect_scene(scene, views, TOLERANCE, views, scale=0.5, background=(0.1, 0.2, 0.3), rounds=1)
     text = found.to_text()
-    assert f"recommended: footprint {found.footprint}, Effects(sh_degree=0)" in text
+    assert f"cheapest within the tolerance: footprint {found.footprint}, Effects(sh_degree=0)" in text
     for name in (*(finding.name for finding in found.findings), "a", "view_001", "32x24", "40x52"):
         assert name in text
     data = json.loads(json.dumps(found.to_json(), allow_nan=False))

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import torch
 
 from ..effects import Effects
+from ..footprints import ADVICE_IN_WORDS
 from ..io import write_safely
 from . import tables
 
@@ -108,7 +109,8 @@ class SceneReport:
         return "\n\n".join([
             f"{self.gaussians} Gaussians of SH degree {self.sh_degree}; {self.machine}\n"
             f"tolerance: RMS of {in_255(self.tolerance)}/255 in every view",
-            f"recommended: footprint {self.footprint}, Effects({', '.join(options)})",
+            f"cheapest within the tolerance: footprint {self.footprint}, Effects({', '.join(options)})\n"
+            f"in general, for {ADVICE_IN_WORDS}",
             tables.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], effects),
             "\n".join(f"{f.name}: {f.reason}" for f in self.findings),
             tables.format_table(["footprint", "RMS [1/255]", "fits", "cost"], tried),

@@ -67,10 +67,10 @@ def inspect_scene(
 ) -> SceneReport:
     """Which effects and which footprint these views of a scene call for, what each changes, and what it costs.
 
-    The recommendation is the cheapest of a few footprints that, with the recommended effects, stays within the
-    tolerance of everything switched on in every view: REFERENCE, all bands of the harmonics, and the 3D filter where it
-    is called for. That is measured in these views. For the bands of harmonics that are left out it is a bound, which
-    holds for any view. Renders every view several times.
+    The choice is the cheapest of a few footprints that, with the chosen effects, stays within the tolerance of
+    everything switched on in every view: REFERENCE, all bands of the harmonics, and the 3D filter where it is called
+    for. That is measured in these views, and is for showing this scene: `footprints.ADVICE` is the general advice. For
+    the bands of harmonics that are left out it is a bound, which holds for any view. Renders every view several times.
 
     Args:
         scene: P Gaussians on the device to measure on.

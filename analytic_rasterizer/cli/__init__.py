@@ -8,6 +8,7 @@ on stderr and exit code 2.
 from __future__ import annotations
 
 from .. import __version__
+from ..footprints import ADVICE_IN_WORDS
 from . import bake, errors, evaluate, inspect, pareto, render, tables, train, view
 from .arguments import Parser, run_command
 
@@ -28,7 +29,8 @@ def main(argv: list[str] | None = None) -> int:
 def build_parser() -> Parser:
     """The parser of all commands."""
     description = "Render 3D Gaussians with pixels that integrate, not sample."
-    parser = Parser(prog="python -m analytic_rasterizer", description=description)
+    advice = f"Footprints to take for {ADVICE_IN_WORDS}. COMMAND --help explains a command."
+    parser = Parser(prog="python -m analytic_rasterizer", description=description, epilog=advice)
     parser.add_argument("--version", action="version", version=f"analytic_rasterizer {__version__}")
     subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in COMMANDS:

@@ -30,8 +30,8 @@ def add_parser(subcommands) -> None:
         "inspect",
         help="say which effects and which footprint a scene calls for, and what they cost",
         description="Render SCENE from the views of VIEWS with every effect that it may call for and with a few "
-        "footprints, and recommend the cheapest that stays within the tolerance of everything switched on. Prints "
-        "what each effect changes and costs, and what the views show. A scene that was trained with 3DGS, or with the "
+        "footprints, and name the cheapest that stay within the tolerance of everything switched on. Prints what each "
+        "effect changes and costs, and what the views show. A scene that was trained with 3DGS, or with the "
         "footprint point, is baked in memory first, and what that gains is printed.",
     )
     add_scene(parser)
