@@ -137,6 +137,7 @@ AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>&
     to->lens.shift += by_lens.shift;
     to->lens.turn += by_lens.turn;
     to->lens.screen = to->lens.screen + by_lens.screen;
+    for (int k = 0; k < kDistortion; ++k) to->lens.distortion[k] += by_lens.distortion[k];
     to->lens.tan_half_fov.x -= by_focal.x * camera.focal.x / camera.lens.tan_half_fov.x;
     to->lens.tan_half_fov.y -= by_focal.y * camera.focal.y / camera.lens.tan_half_fov.y;
   }

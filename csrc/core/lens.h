@@ -6,14 +6,19 @@
 
 namespace ar {
 
+inline constexpr int kDistortion = 12;
+
 template <typename T> struct Lens {
-  Vec2<T> tan_half_fov;  ///< orthographic: half the width and height, world units
-  Vec2<T> center;        ///< x/z and y/z at the middle of the picture, for the clamp of a pinhole
-  T aperture, focus;     ///< world units
-  Vec3<T> shift, turn;   ///< of the camera during the exposure, along its axes [world units, radians]
-  Vec2<T> screen;        ///< of the picture during the exposure [px]
-  T near, far;           ///< of camera-space z; no gradient
-  T model;               ///< index in CameraModels; no gradient
+  Vec2<T> tan_half_fov;       ///< orthographic: half the width and height, world units
+  Vec2<T> center;             ///< x/z and y/z at the middle of the picture: a pinhole's clamp, a lens's principal point
+  T aperture, focus;          ///< world units
+  Vec3<T> shift, turn;        ///< of the camera during the exposure, along its axes [world units, radians]
+  Vec2<T> screen;             ///< of the picture during the exposure [px]
+  T distortion[kDistortion];  ///< coefficients of the model
+  // Without gradient:
+  T near, far;    ///< of the depth
+  T reach, fold;  ///< lens_model.h: from where the Jacobian is clamped, and where the model ends
+  T model;        ///< index in CameraModels
 
   AR_HD bool moves() const {
     return shift.x != T(0) || shift.y != T(0) || shift.z != T(0) || turn.x != T(0) || turn.y != T(0) ||
@@ -26,14 +31,17 @@ struct LensMember {
   int size;
 };
 inline constexpr LensMember kLensMembers[] = {
-    {"tan_half_fov", 2}, {"center", 2}, {"aperture", 1}, {"focus", 1}, {"shift", 3},
-    {"turn", 3},         {"screen", 2}, {"near", 1},     {"far", 1},   {"model", 1},
+    {"tan_half_fov", 2}, {"center", 2}, {"aperture", 1}, {"focus", 1},
+    {"shift", 3},        {"turn", 3},   {"screen", 2},   {"distortion", kDistortion},
+    {"near", 1},         {"far", 1},    {"reach", 1},    {"fold", 1},
+    {"model", 1},
 };
 inline constexpr int kLensWidth = [] {
   int width = 0;
   for (const LensMember& member : kLensMembers) width += member.size;
   return width;
 }();
+inline constexpr int kLensFixed = 5;  ///< that many at the end have no gradient
 static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
 
 /// A blurred Gaussian with a smaller det Sigma [px^4] has no mass: nothing derived overflows a float.

@@ -48,7 +48,7 @@ inline constexpr int kProjectThreads = 128;
 /// Loads of the camera against an even share of Gaussians.
 inline constexpr int kProjectBlocksPerSm = 32;
 /// With six blocks a thread would have 80 registers, and spill. The full camera needs all registers.
-inline constexpr int kProjectVjpBlocks = 5, kFullProjectVjpBlocks = 1;
+inline constexpr int kProjectVjpBlocks = 5, kFullProjectVjpBlocks = 3;
 /// A whole warp sums splats with more pairs.
 inline constexpr int kManyPairs = 64;
 /// Rows that a lane loads at once: registers against waiting.

@@ -67,7 +67,7 @@ void expect_gradient(const Vec3<double>& actual, Vec3<double> point, const Funct
 /// The same by every number of a lens that has a gradient. `f` takes the camera.
 template <class Function>
 void expect_lens_gradient(Lens<double> actual, const FullCamera<double>& camera, const Function& f, double size) {
-  for (int k = 0; k < kLensWidth - 3; ++k) {  // near, far and model have none
+  for (int k = 0; k < kLensWidth - kLensFixed; ++k) {
     const auto moved = [&](double t) {
       FullCamera<double> other = camera;
       reinterpret_cast<double*>(&other.lens)[k] += t;

@@ -92,11 +92,11 @@ template <typename T> Sym3<T> cov3d_of(Vec4<T> rotation, Vec3<T> s) {
   return {at(0, 0), at(0, 1), at(0, 2), at(1, 1), at(1, 2), at(2, 2)};
 }
 
-constexpr Field kCameraFields[] = {{"view_x", 0, 4},  {"view_y", 4, 4},    {"view_z", 8, 4},    {"clip_x", 12, 4},
-                                   {"clip_y", 16, 4}, {"clip_w", 20, 4},   {"position", 24, 3}, {"tan", 27, 2},
-                                   {"center", 29, 2}, {"aperture", 31, 1}, {"focus", 32, 1},    {"shift", 33, 3},
-                                   {"turn", 36, 3},   {"screen", 39, 2}};
-constexpr int kFirstFixed = 41;  ///< near, far and model have no gradient
+constexpr Field kCameraFields[] = {
+    {"view_x", 0, 4},  {"view_y", 4, 4},    {"view_z", 8, 4}, {"clip_x", 12, 4}, {"clip_y", 16, 4},
+    {"clip_w", 20, 4}, {"position", 24, 3}, {"tan", 27, 2},   {"center", 29, 2}, {"aperture", 31, 1},
+    {"focus", 32, 1},  {"shift", 33, 3},    {"turn", 36, 3},  {"screen", 39, 2}, {"distortion", 41, kDistortion}};
+constexpr int kFirstFixed = kCameraGradWidth - kLensFixed;
 
 /// Each effect alone, then none, then together.
 int effects_of(int trial) { return trial % 8 < 5 ? 1 << (trial % 8) : trial % 8 == 5 ? 0 : int(kAllEffects); }
@@ -186,8 +186,8 @@ void expect_derivatives(const Field& field, double h, const double* actual, cons
     expected[k] = derivative([&](double t) { return loss_at(k, t); }, h);
     largest = std::max(largest, std::abs(expected[k]));
   }
-  for (int k = 0; k < field.count; ++k) {  // rounding: eps L / h, L of order one
-    ASSERT_NEAR(actual[k], expected[k], 1e-6 * largest + 1e-15 / std::abs(h))
+  for (int k = 0; k < field.count; ++k) {  // rounding: 1.5 eps L / h, the differences' weights times L of up to 6
+    ASSERT_NEAR(actual[k], expected[k], 1e-6 * largest + 2e-15 / std::abs(h))
         << field.name << " " << k << " trial " << trial;
   }
 }
@@ -227,11 +227,15 @@ template <class Cam> void expect_gradients_match_differences(const Footprint& f,
     const Vec2<double> center = at.lens.center;
     if (near_zero(splat.color.x) || near_zero(splat.color.y) || near_zero(splat.color.z) ||
         near_edge(view.x / view.z, center.x, loss.camera.limit.x) ||
-        near_edge(view.y / view.z, center.y, loss.camera.limit.y) || seen.gap < 0.1 * seen.wide * seen.wide) {
+        near_edge(view.y / view.z, center.y, loss.camera.limit.y) ||
+        near_edge(std::hypot(view.x, view.y) / view.z, 0, at.lens.reach) ||
+        near_edge(std::atan2(std::hypot(view.x, view.y), view.z), 0, at.lens.reach) ||
+        seen.gap < 0.1 * seen.wide * seen.wide) {
       continue;
     }
     ++checked;
     const bool orthographic = model == kCameraModel<Orthographic>;
+    const bool lens = !orthographic && model != kCameraModel<Pinhole>;
     clamped += !orthographic && (factors.jacobian.clamped_x || factors.jacobian.clamped_y);
     blurred += seen.wide > 1.1 * own.wide;
     for (int k = 0; k < 3; ++k) {
@@ -284,12 +288,13 @@ template <class Cam> void expect_gradients_match_differences(const Footprint& f,
       const auto camera_step = [&](const Field& field) {
         return field.first < 24    ? std::min(move, turn) / reach
                : field.first < 27  ? 1e-3 * z
-               : field.first < 31  ? turn
+               : field.first < 31  ? (lens ? std::min(move / z, turn) : turn)  // these move what is seen through a lens
                : field.first == 31 ? 1e-3 * std::max(at.lens.aperture, 0.01)
                : field.first == 32 ? refocus
                : field.first < 36  ? move
                : field.first < 39  ? move / (1 + scale)
-                                   : 1e-3 * own.narrow;
+               : field.first < 41  ? 1e-3 * own.narrow
+                                   : std::min(move, turn) / (1 + 15 * scale);  // up to r^7 of the focal length
       };
       for (const Field& field : kCameraFields) {
         const auto loss_at = [&](int k, double t) {

@@ -83,7 +83,7 @@ template <typename T> Lens<T> plain_lens(T tan_x, T tan_y) {
   lens.tan_half_fov = {tan_x, tan_y};
   lens.focus = T(1);
   lens.near = T(kNear);
-  lens.far = std::numeric_limits<T>::infinity();
+  lens.far = lens.reach = lens.fold = std::numeric_limits<T>::infinity();
   return lens;
 }
 
@@ -163,6 +163,12 @@ template <typename T> View<T> random_view(Random& random, int effects, int model
     view.lens = plain_lens<T>(view.test.tan_x, view.test.tan_y);
   }
   view.lens.model = T(model);
+  if (model == kCameraModel<Fov>) {
+    view.lens.distortion[0] = T(random.uniform(0.2, 1.5));
+  } else if (model != kCameraModel<Pinhole> && model != kCameraModel<Orthographic>) {
+    for (T& k : view.lens.distortion) k = T(0.02 * random.normal());
+  }
+  view.lens.reach = T(random.uniform(0.5, 1));
   const auto normal = [&](double size) { return T(size * random.normal()); };
   if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
   if (effects & kDefocus) {

@@ -99,8 +99,8 @@ template <typename T> struct ProjectedMean {
 /// Rows of A = J W, world units to px: J in camera space, W the upper left 3x3 of the view.
 template <typename T> struct Jacobian {
   Vec3<T> x, y;
-  T ratio_x, ratio_y;  ///< of Pinhole: clamped x/z and y/z
-  bool clamped_x, clamped_y;
+  T ratio_x, ratio_y;         ///< of Pinhole: clamped x/z and y/z
+  bool clamped_x, clamped_y;  ///< of a lens both alike
 };
 /// `log_size` = x . j.x + y . j.y: by the logarithm of a factor of J.
 template <typename T> struct JacobianGrad {

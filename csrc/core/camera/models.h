@@ -4,7 +4,10 @@
 
 #include <type_traits>
 
+#include "core/camera/fisheye.h"
+#include "core/camera/fov.h"
 #include "core/camera/orthographic.h"
+#include "core/camera/perspective.h"
 #include "core/camera/pinhole.h"
 
 namespace ar {
@@ -12,7 +15,7 @@ namespace ar {
 template <class... M> struct CameraModelList {};
 
 /// Lens::model is an index in this list.
-using CameraModels = CameraModelList<Pinhole, Orthographic>;
+using CameraModels = CameraModelList<Pinhole, Orthographic, Perspective, Fisheye, RadTanFisheye, Fov>;
 
 template <class... M> constexpr int count_of_models(CameraModelList<M...>) { return sizeof...(M); }
 inline constexpr int kCameraModels = count_of_models(CameraModels());
