@@ -5,7 +5,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
 - `Gaussians`, `View`: what is rendered, and from where (docs/library.md).
 - `GaussianRasterizationSettings`, `GaussianRasterizer`: rendering, with the interface of 3DGS 2023.
 - `FOOTPRINTS`, `set_default_footprint`, `footprint_weight`: the weight of a Gaussian in a pixel (docs/footprints.md).
-- `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
+- `Effects`, `Outputs`, `Lens`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, cameras (docs/effects.md).
 - `project`, `list_tiles`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
 - `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
 - `density`: how many Gaussians there are, in a training loop of one's own (docs/density.md).
@@ -37,6 +37,7 @@ from .footprints import (
     set_default_footprint,
 )
 from .gaussians import Gaussians
+from .lens import Lens
 from .outputs import normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
@@ -56,6 +57,7 @@ __all__ = [
     "GaussianRasterizer",
     "GaussianStats",
     "Gaussians",
+    "Lens",
     "Motion",
     "Outputs",
     "SceneReport",

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from . import _C
+from .lens import Lens
 
 MAX_SH_DEGREE = _C.MAX_SH_DEGREE
 NEAR = _C.NEAR  # camera-space z up to which everything is culled
@@ -173,6 +174,8 @@ class Effects:
         near: Camera-space z up to which everything is culled, world units.
         far: Camera-space z from which on everything is culled.
         filter_3d: (P,) of `compute_3d_filter`: widens scales and lowers opacities (`apply_3d_filter`).
+        lens: `Lens`, or None for a pinhole. Depths are then those of the model: z of `perspective` and `fov`, the
+            distance from the camera of the others, by which splats are ordered too.
         defocus: `Defocus`, or None for a pinhole.
         motion: `Motion`, or None for an instant.
         sh_degree: Highest degree of spherical harmonics to use, 0 to 4; None: that of the settings.
@@ -197,6 +200,7 @@ class Effects:
     defocus: Defocus | None = None
     motion: Motion | None = None
     sh_degree: int | None = None
+    lens: Lens | None = None
 
     __eq__ = _equal
 
@@ -204,10 +208,12 @@ class Effects:
         for name in (*OUTPUTS, "camera_gradients", "orthographic", "off_center"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} must be a bool, got {getattr(self, name)!r}")
-        for name, kind in (("filter_3d", torch.Tensor), ("defocus", Defocus), ("motion", Motion)):
+        for name, kind in (("filter_3d", torch.Tensor), ("defocus", Defocus), ("motion", Motion), ("lens", Lens)):
             value = getattr(self, name)
             if not (value is None or isinstance(value, kind)):
                 raise TypeError(f"{name} must be a {kind.__name__} or None, got {value!r}")
+        if self.lens is not None and self.orthographic:
+            raise ValueError("lens must be None for an orthographic camera")
         degree = self.sh_degree
         if isinstance(degree, bool) or not (degree is None or isinstance(degree, Integral)):
             raise TypeError(f"sh_degree must be a whole number or None, got {degree!r}")
@@ -242,6 +248,7 @@ class Effects:
             or (self.near, self.far) != (NEAR, math.inf)
             or self.defocus is not None
             or self.motion is not None
+            or self.lens is not None
         )
 
     def lens_members(self) -> dict:
@@ -251,6 +258,8 @@ class Effects:
         """
         model = _C.CAMERA_MODELS.index("orthographic" if self.orthographic else "pinhole")
         members = {"focus": 1.0, "near": self.near, "far": self.far, "model": float(model)}
+        if self.lens:
+            members |= self.lens.members()
         if self.defocus:
             members |= {"aperture": self.defocus.aperture, "focus": self.defocus.focus}
         if self.motion:

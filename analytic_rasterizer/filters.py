@@ -92,6 +92,8 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     `camera` is a `GaussianRasterizationSettings`.
     """
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
+    if effects.lens is not None:
+        raise ValueError(f"the sampling interval of cameras with a lens is not known, got a {effects.lens.model} lens")
     clip = camera.projmatrix.reshape(4, 4).to(means3D)
     z = depths(means3D, camera.viewmatrix.to(means3D))
     columns = means3D.split(1, dim=1)  # not `@`, which autocast and TF32 round

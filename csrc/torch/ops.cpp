@@ -4,7 +4,9 @@
 #include <pybind11/stl.h>
 #include <torch/library.h>
 
+#include <algorithm>
 #include <cstddef>
+#include <limits>
 #include <new>
 #include <string>
 #include <utility>
@@ -132,6 +134,38 @@ std::vector<std::string> image_names() {
   return names;
 }
 
+template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
+
+/// What a lens makes of points (N, 3) in camera space: positions (N, 2) in focal lengths from the principal point, and
+/// their derivatives (N, 2, 3). Float64 on the CPU, for the limits of a lens and for tests.
+std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<double> distortion, const Tensor& points) {
+  const std::vector<std::string> names = names_of(CameraModels());
+  const auto found = std::find(names.begin(), names.end(), model);
+  TORCH_CHECK(found != names.end() && distortion.size() == size_t(kDistortion) && points.dim() == 2 &&
+              points.size(1) == 3 && points.scalar_type() == at::kDouble && points.device().is_cpu());
+  constexpr double inf = std::numeric_limits<double>::infinity();
+  FullCamera<double> camera = {};
+  camera.view_x.x = camera.view_y.y = camera.view_z.z = 1;
+  camera.size = camera.focal = {1, 1};  // the middle of such a picture is pixel 0
+  camera.lens.near = -inf;
+  camera.lens.far = camera.lens.reach = camera.lens.fold = inf;
+  camera.lens.model = double(found - names.begin());
+  std::copy(distortion.begin(), distortion.end(), camera.lens.distortion);
+  const int64_t n = points.size(0);
+  const Tensor read = points.contiguous(), seen = at::empty({n, 2}, read.options());
+  const Tensor slopes = at::empty({n, 2, 3}, read.options());
+  const auto* p = reinterpret_cast<const Vec3<double>*>(read.const_data_ptr<double>());
+  auto* u = reinterpret_cast<Vec2<double>*>(seen.mutable_data_ptr<double>());
+  auto* j = reinterpret_cast<Vec3<double>*>(slopes.mutable_data_ptr<double>());
+  for (int64_t i = 0; i < n; ++i) {
+    u[i] = project_mean(camera, p[i]).pixel;
+    const Jacobian<double> rows = make_jacobian(camera, p[i]);
+    j[2 * i] = rows.x;
+    j[2 * i + 1] = rows.y;
+  }
+  return {seen, slopes};
+}
+
 /// (name, size) of the members of Lens.
 std::vector<std::pair<std::string, int>> lens_members() {
   std::vector<std::pair<std::string, int>> members;
@@ -140,7 +174,6 @@ std::vector<std::pair<std::string, int>> lens_members() {
 }
 
 /// In the order of their numbers.
-template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
 
 /// As Python indexes them.
 pybind11::object columns_at(int64_t first, int64_t count) {
@@ -232,6 +265,8 @@ PYBIND11_MODULE(_C, m) {
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();
+  m.def("lens_points", &ar::ops::lens_points,
+        "Positions and derivatives of points through a lens (csrc/torch/ops.cpp).");
   m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();

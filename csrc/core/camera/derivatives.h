@@ -65,24 +65,29 @@ template <class S> AR_HD Dual<S> root(const Dual<S>& v) {
   return {r, (S(0.5) / r) * v.gradient};
 }
 
-/// Angle over sine, by h = 1 - cosine, 0 <= h < 2: sum of n!/(2n + 1)!! h^n, which has no singularity at 0.
+/// Angle over sine, by h = 1 - cosine, 0 <= h < 2: sum of n!/(2n + 1)!! h^n, which has no singularity at 0. k = 2 - h
+/// is a parameter too, for angles near pi, where the difference would lose digits.
 inline constexpr double kArcSeriesEnd = 0.1;
 inline constexpr int kArcTerms = 14;  // the next is below 1e-18 of the sum
-template <typename T> AR_HD T arc(T h) {
+template <typename T> AR_HD T arc(T h, T k) {
   if (h < T(kArcSeriesEnd)) {
     T sum = T(1);
     for (int n = kArcTerms; n > 0; --n) sum = T(1) + T(n) / T(2 * n + 1) * h * sum;
     return sum;
   }
-  const T sine = sqrt(h * (T(2) - h));
+  const T sine = sqrt(h * k);
   return quotient(T(std::atan2(sine, T(1) - h)), sine);
 }
-template <class S> AR_HD S arc_slope(S h);
-template <typename T> AR_HD Line<T> arc(Line<T> h) { return Line<T>(arc(h.value), arc_slope(h.value) * h.slope); }
-template <class S> AR_HD Dual<S> arc(const Dual<S>& h) { return {arc(h.value), arc_slope(h.value) * h.gradient}; }
+template <class S> AR_HD S arc_slope(S h, S k);
+template <typename T> AR_HD Line<T> arc(Line<T> h, Line<T> k) {
+  return Line<T>(arc(h.value, k.value), arc_slope(h.value, k.value) * h.slope);
+}
+template <class S> AR_HD Dual<S> arc(const Dual<S>& h, const Dual<S>& k) {
+  return {arc(h.value, k.value), arc_slope(h.value, k.value) * h.gradient};
+}
 
-/// d arc / dh. It solves h (2 - h) arc' = 1 - (1 - h) arc.
-template <class S> AR_HD S arc_slope(S h) {
+/// d arc / dh. It solves h k arc' = 1 - (1 - h) arc.
+template <class S> AR_HD S arc_slope(S h, S k) {
   if (value_of(h) < kArcSeriesEnd) {
     S sum = S(1), slope = S(0);  // Horner's scheme, and its derivative
     for (int n = kArcTerms; n > 0; --n) {
@@ -92,7 +97,7 @@ template <class S> AR_HD S arc_slope(S h) {
     }
     return slope;
   }
-  return (S(1) - (S(1) - h) * arc(h)) / (h * (S(2) - h));
+  return (S(1) - (S(1) - h) * arc(h, k)) / (h * k);
 }
 
 }  // namespace ar

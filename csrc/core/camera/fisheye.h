@@ -11,9 +11,10 @@ namespace ar {
 template <class N> AR_HD Vec2<N> equidistant(Vec3<N> p) {
   using S = decltype(value_of(p.x));
   const N rho2 = p.x * p.x + p.y * p.y, n = root(rho2 + p.z * p.z);
-  // 1 - cosine; in front of the camera without the cancellation of 1 - z / n
-  const N h = value_of(p.z) > S(0) ? rho2 / (n * (n + p.z)) : (n - p.z) / n;
-  const N scale = arc(h) / n;
+  // 1 minus and 1 plus the cosine, without cancellation
+  const bool ahead = value_of(p.z) > S(0);
+  const N near = ahead ? rho2 / (n * (n + p.z)) : (n - p.z) / n, far = ahead ? (n + p.z) / n : rho2 / (n * (n - p.z));
+  const N scale = arc(near, far) / n;
   return {scale * p.x, scale * p.y};
 }
 

@@ -15,7 +15,7 @@ struct Fov : PerspectiveLens<Fov> {
     const S tangent = S(2) * half_tangent(k[0]);
     // atan(t) / t = (angle / sine) cosine at the angle with tangent t
     const N t2 = (tangent * tangent) * (a * a + b * b), n = root(S(1) + t2), h = t2 / (n * (S(1) + n));
-    const N scale = (tangent / k[0]) * (arc(h) / n);
+    const N scale = (tangent / k[0]) * (arc(h, S(2) - h) / n);
     return {scale * a, scale * b};
   }
 

@@ -1,0 +1,224 @@
+"""Lenses: cameras whose photographs are not those of a pinhole (`Effects.lens`, csrc/core/camera/)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+
+from . import _C
+
+SIZE = dict(_C.LENS)["distortion"]
+# By model: how many coefficients there are at most, radial, tangential and thin prism ones, and where each kind begins.
+_PARTS = {
+    "perspective": ((6, 0), (2, 6), (4, 8)),
+    "fisheye": ((4, 0), (2, 6), (4, 8)),
+    "rad_tan_fisheye": ((6, 0), (2, 6), (4, 8)),
+}
+MODELS = (*_PARTS, "fov")
+WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis
+_DIRECTIONS, _ANGLES = 64, 512  # of the rays with which limits are found
+_WIDEST_PERSPECTIVE = math.radians(89.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """How a lens bends what a pinhole would see. Focal lengths and principal point are those of the settings.
+
+    The classmethods make one from the names of OpenCV and COLMAP. A Gaussian's mean goes through the exact map, its
+    covariance through its exact Jacobian there. Gaussians beyond the angle at which the map folds back are culled.
+
+    Attributes:
+        model: One of `perspective`, `fisheye`, `rad_tan_fisheye`, `fov`.
+        coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable.
+        reach: Angle from the axis, rad, beyond which the Jacobian is that of a ray at this angle; None: 1.3 times the
+            largest (of its tangent, for `perspective` and `fov`) that the picture sees. To find that, the host waits
+            for a CUDA device, unless `camera_settings` made the settings.
+
+    Raises:
+        TypeError: Coefficients are no numbers.
+        ValueError: An unknown model, or too many coefficients, or numbers that are not finite.
+    """
+
+    model: str
+    coefficients: Sequence[float] | torch.Tensor
+    reach: float | None = None
+
+    def __post_init__(self):
+        if self.model not in MODELS:
+            raise ValueError(f"model must be one of {', '.join(MODELS)}, got {self.model!r}")
+        given = self.coefficients
+        if isinstance(given, torch.Tensor):
+            if given.shape != (SIZE,):
+                raise ValueError(f"coefficients must have shape ({SIZE},), got {tuple(given.shape)}")
+        else:
+            numbers = _numbers("coefficients", given, SIZE)
+            object.__setattr__(self, "coefficients", numbers + (0.0,) * (SIZE - len(numbers)))
+            if self.model == "fov" and not 0 < numbers[0] < math.pi:
+                raise ValueError(f"w of a fov lens must be above 0 and below pi, got {numbers[0]}")
+        if self.reach is not None and not 0 < self.reach <= math.pi:
+            raise ValueError(f"reach must be above 0 and at most pi, got {self.reach}")
+
+    @classmethod
+    def perspective(cls, radial=(), tangential=(), thin_prism=()) -> Lens:
+        """OpenCV's lens, of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV too.
+
+        Args:
+            radial: Up to six numbers k1 to k6; k4, k5 and k6 divide.
+            tangential: p1, p2.
+            thin_prism: Up to four numbers s1 to s4.
+
+        Raises:
+            TypeError, ValueError: Numbers as in `Lens`.
+        """
+        return cls("perspective", _arranged("perspective", radial, tangential, thin_prism))
+
+    @classmethod
+    def fisheye(cls, radial=(), tangential=(), thin_prism=()) -> Lens:
+        """OpenCV's fisheye, of COLMAP's SIMPLE_FISHEYE to THIN_PRISM_FISHEYE too: equidistant, then distorted.
+
+        Args:
+            radial: Up to four numbers k1 to k4, factors of the angle's powers 3, 5, 7 and 9.
+            tangential: p1, p2.
+            thin_prism: Up to four numbers s1 to s4; COLMAP's sx1 and sy1 are s1 and s3.
+
+        Raises:
+            TypeError, ValueError: Numbers as in `Lens`.
+        """
+        return cls("fisheye", _arranged("fisheye", radial, tangential, thin_prism))
+
+    @classmethod
+    def rad_tan_fisheye(cls, radial=(), tangential=(), thin_prism=()) -> Lens:
+        """COLMAP's RAD_TAN_THIN_PRISM_FISHEYE: tangential and thin prism terms of the point after the radial ones.
+
+        Args:
+            radial: Up to six numbers k0 to k5.
+            tangential: p0, p1.
+            thin_prism: Up to four numbers s0 to s3.
+
+        Raises:
+            TypeError, ValueError: Numbers as in `Lens`.
+        """
+        return cls("rad_tan_fisheye", _arranged("rad_tan_fisheye", radial, tangential, thin_prism))
+
+    @classmethod
+    def fov(cls, w: float) -> Lens:
+        """COLMAP's FOV: the distance in the picture is atan(2 r tan(w/2)) / w, r that of a pinhole.
+
+        Raises:
+            TypeError, ValueError: w is no number above 0 and below pi.
+        """
+        return cls("fov", (w,))
+
+    def with_reach(self, tangents: Sequence[float], center: Sequence[float]) -> Lens:
+        """The same with `reach` for a picture, unless it has one.
+
+        Args:
+            tangents: tanfovx and tanfovy of the settings.
+            center: x/z and y/z of a pinhole at the middle of the picture.
+        """
+        if self.reach is not None:
+            return self
+        reach = _reach(self.model, self._values(), *map(float, tangents), *map(float, center))
+        return Lens(self.model, self.coefficients, reach)
+
+    @property
+    def fold(self) -> float:
+        """The angle from the axis at which the map folds back, rad, or where the model ends. Reads the coefficients."""
+        return _fold(self.model, self._values())
+
+    def members(self) -> dict:
+        """The entries of the operator's argument `lens`, by the names of `_C.LENS`."""
+        measure = (lambda angle: angle) if self.model in WIDE else (lambda angle: math.tan(min(angle, 1.57)))
+        return {
+            "model": float(_C.CAMERA_MODELS.index(self.model)),
+            "distortion": self.coefficients if isinstance(self.coefficients, torch.Tensor) else list(self.coefficients),
+            "reach": measure(self.reach),
+            "fold": measure(self.fold),
+        }
+
+    def _values(self) -> tuple[float, ...]:
+        given = self.coefficients
+        return tuple(given.detach().double().tolist()) if isinstance(given, torch.Tensor) else given
+
+    def __eq__(self, other: object):
+        if not isinstance(other, Lens):
+            return NotImplemented
+        same = self.coefficients is other.coefficients or self._values() == other._values()
+        return same and (self.model, self.reach) == (other.model, other.reach)
+
+    def __hash__(self):
+        return hash((self.model, self.reach))  # tensors that are equal have different hashes
+
+
+def _numbers(name: str, given, most: int) -> tuple[float, ...]:
+    if isinstance(given, (str, torch.Tensor)) or not hasattr(given, "__len__"):
+        raise TypeError(f"{name} must be a sequence of numbers, got {given!r}")
+    if len(given) > most:
+        raise ValueError(f"{name} must have at most {most} numbers, got {len(given)}")
+    for number in given:
+        if isinstance(number, (bool, str)) or not hasattr(number, "__float__"):
+            raise TypeError(f"every number of {name} must be a number, got {number!r}")
+        if not math.isfinite(float(number)):
+            raise ValueError(f"every number of {name} must be finite, got {number}")
+    return tuple(float(number) for number in given)
+
+
+def _arranged(model: str, radial, tangential, thin_prism) -> tuple[float, ...]:
+    to = [0.0] * SIZE
+    given = {"radial": radial, "tangential": tangential, "thin_prism": thin_prism}
+    for (name, values), (most, first) in zip(given.items(), _PARTS[model]):
+        numbers = _numbers(name, values, most)
+        to[first : first + len(numbers)] = numbers
+    return tuple(to)
+
+
+def _rays(angles: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Unit vectors (angles, directions, 3) from the axis, and their derivatives along the angle and across."""
+    turns = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2 * math.pi / _DIRECTIONS)
+    angle, turn = torch.meshgrid(angles, turns, indexing="ij")
+    sine, cosine, x, y, zero = angle.sin(), angle.cos(), turn.cos(), turn.sin(), torch.zeros_like(angle)
+    return (
+        torch.stack([sine * x, sine * y, cosine], -1),
+        torch.stack([cosine * x, cosine * y, -sine], -1),
+        torch.stack([-y, x, zero], -1),
+    )
+
+
+def _end(model: str) -> float:
+    return math.pi - 1e-3 if model in WIDE else _WIDEST_PERSPECTIVE
+
+
+@lru_cache(maxsize=4096)
+def _fold(model: str, coefficients: tuple[float, ...]) -> float:
+    first, last = 0.0, _end(model)
+    for _ in range(2):  # the second time between two neighbours of the first
+        angles = torch.linspace(first, last, _ANGLES + 1, dtype=torch.float64)
+        ray, along, across = _rays(angles)
+        slopes = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[1].reshape(*ray.shape[:2], 2, 3)
+        u, v = (slopes * along[..., None, :]).sum(-1), (slopes * across[..., None, :]).sum(-1)
+        area = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+        good = ((area > 0) & area.isfinite()).all(1).tolist()
+        if all(good):
+            return last
+        k = good.index(False)
+        if k == 0:
+            raise ValueError(f"the {model} lens with coefficients {coefficients} is no map at its axis")
+        first, last = float(angles[k - 1]), float(angles[k])
+    return first
+
+
+@lru_cache(maxsize=4096)
+def _reach(model: str, coefficients: tuple[float, ...], tan_x: float, tan_y: float, x: float, y: float) -> float:
+    fold = _fold(model, coefficients)
+    angles = torch.linspace(0, fold, _ANGLES + 1, dtype=torch.float64)
+    ray = _rays(angles)[0]
+    seen = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[0].reshape(*ray.shape[:2], 2)
+    inside = ((seen[..., 0] - x).abs() <= tan_x) & ((seen[..., 1] - y).abs() <= tan_y)
+    inside = inside.any(1).nonzero()
+    largest = float(angles[min(int(inside[-1]) + 1, _ANGLES)]) if len(inside) else fold
+    clamp = _C.FRUSTUM_CLAMP
+    return min(fold, clamp * largest if model in WIDE else math.atan(clamp * math.tan(largest)))
