@@ -232,7 +232,7 @@ def _needles(brush: Brush, random, left, top) -> None:
 
 # ---------------------------------------------------------------------------------- measuring
 
-REPEATS = 7  # renders of which the fastest is reported
+REPEATS = 30  # renders of which the fastest is reported
 
 
 class Picture(NamedTuple):
