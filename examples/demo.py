@@ -44,7 +44,7 @@ COLUMNS = {  # footprint: its title on the sheet
     "cumulant": "cumulant",
     "box:samples=1": "box, 1 sample",
     "box:samples=4": "box, 4 samples",
-    "moment:samples=4": "moment, 4 cells",
+    "moment:samples=4": "moment, 4 samples",
 }
 
 INK = (0.09, 0.11, 0.17)
@@ -232,7 +232,7 @@ def _needles(brush: Brush, random, left, top) -> None:
 
 # ---------------------------------------------------------------------------------- measuring
 
-REPEATS = 7  # renders of which the fastest is reported
+REPEATS = 30  # renders of which the fastest is reported
 
 
 class Picture(NamedTuple):
