@@ -1,6 +1,6 @@
-// Front-to-back compositing of one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its
-// adjoint"). A library for the loops of cpu/ and cuda/. For samples that move, map_placed_sample makes the AdjointMap
-// of a segment. mean_sums_of makes a pixel's part of MeanSums.
+// Front-to-back compositing of one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and
+// its adjoint"). A library for the loops of cpu/ and cuda/. For samples that move, map_placed_sample makes the
+// AdjointMap of a segment. mean_sums_of makes a pixel's part of MeanSums.
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.
@@ -101,9 +101,9 @@ template <class V> struct BlendGrad {
 
 /// Adjoint of blend_sample, called from the last splat to the first.
 ///
-/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of docs/internals/numerics.md) is
-/// that product for all later splats and the background, seen through this splat alone. `transmittance` and `behind`
-/// are read as after the splat, written as before it.
+/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of
+/// docs/internals/numerics.md) is that product for all later splats and the background, seen through this splat alone.
+/// `transmittance` and `behind` are read as after the splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));

@@ -60,8 +60,8 @@ template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance,
   return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);
 }
 
-/// docs/internals/numerics.md, "Gradient with respect to a blur". For a thin needle g.yy may cancel the amplitude, so both
-/// multiply the same numbers.
+/// docs/internals/numerics.md, "Gradient with respect to a blur". For a thin needle g.yy may cancel the amplitude, so
+/// both multiply the same numbers.
 template <typename T>
 AR_HD Blur<T> seen_covariance_vjp(const SplatGrad<T>& grad, const BlurContext<Blur<T>, T>& context) {
   const Vec2<T>& b = context.blur.streak;

@@ -6,14 +6,14 @@
 
 namespace ar {
 
-/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/internals/numerics.md, "Weights". t is the diagonal
-/// entry of the conic. Weights beyond the cap are below 2e-6.
+/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/internals/numerics.md, "Weights". t is the
+/// diagonal entry of the conic. Weights beyond the cap are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // by t
 
-  /// Of `unit` times h, for p and t in coordinates in which the conic is divided by `scale` (docs/internals/numerics.md, "Units
-  /// of the exponent").
+  /// Of `unit` times h, for p and t in coordinates in which the conic is divided by `scale`
+  /// (docs/internals/numerics.md, "Units of the exponent").
   AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
     const T dx = scale * T(kPixelVariance), x = t * dx;
     const bool floored = T(1) - x < T(1e-6);

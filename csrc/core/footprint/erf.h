@@ -8,8 +8,8 @@
 
 namespace ar {
 
-/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, with Phi over the window of each axis (docs/internals/numerics.md, "The rotated window"). The
-/// adjoint holds the frame fixed.
+/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, with Phi over the window of each axis (docs/internals/numerics.md, "The rotated
+/// window"). The adjoint holds the frame fixed.
 struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
   static constexpr bool kExpensive = true;

@@ -1,6 +1,6 @@
 // The footprint `moment`: the pixel as S equal square cells, each with its own transmittance. A splat is evaluated at
-// the centroid of the light that earlier splats have left in the cell (docs/internals/numerics.md, "Moving nodes"). registry.h
-// lists it, and blend.h calls the functions of samples that move.
+// the centroid of the light that earlier splats have left in the cell (docs/internals/numerics.md, "Moving nodes").
+// registry.h lists it, and blend.h calls the functions of samples that move.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -105,8 +105,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     }
   }
 
-  /// alpha_and_move_vjp() by z, added to `sums`. q is the v r y of docs/internals/numerics.md. dL_dat is in kMoveGradUnit. alpha
-  /// and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
+  /// alpha_and_move_vjp() by z, added to `sums`. q is the v r y of docs/internals/numerics.md. dL_dat is in
+  /// kMoveGradUnit. alpha and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
   template <typename T, class V, class Cell>
   AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
                                               Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
@@ -125,8 +125,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
-  /// Moves `at` as move_in() does. Returns J and dalpha of docs/internals/numerics.md, "Adjoint of moving nodes". `free`: alpha
-  /// is not capped.
+  /// Moves `at` as move_in() does. Returns J and dalpha of docs/internals/numerics.md, "Adjoint of moving nodes".
+  /// `free`: alpha is not capped.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {

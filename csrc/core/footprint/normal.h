@@ -83,8 +83,8 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   return m;
 }
 
-/// From the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2) (docs/internals/numerics.md, "Gradients of the
-/// weights").
+/// From the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2) (docs/internals/numerics.md, "Gradients of
+/// the weights").
 template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, GradFrame frame) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
   return {transform_transposed(w, sums.offset), w, half, T(0), T(0), frame};
