@@ -13,7 +13,7 @@ from processes import run_program
 from analytic_rasterizer import _C, installation
 
 PACKAGES = ("analytic_rasterizer", "diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
-LIBRARY = next((ROOT / "analytic_rasterizer").glob("_C.*"))
+LIBRARY = next((ROOT / "analytic_rasterizer").glob("_C.*.so"))
 
 
 def copy_of_packages(folder, with_extension=False):
