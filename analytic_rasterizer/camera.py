@@ -81,9 +81,7 @@ def camera_settings(
     center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1])
     projection, position = camera_matrices(view, scale, center, orthographic)
     if isinstance(effects, Effects) and effects.lens is not None:
-        at_middle = -center.detach() / scale.detach()
-        lens = effects.lens.with_reach([t.item() for t in tangents], at_middle.tolist())
-        effects = replace(effects, lens=lens)
+        effects = replace(effects, lens=effects.lens.with_reach(tangents, -center / scale))
     # Numbers, unless their gradient may be asked for: reading them later makes the host wait for the device.
     asked_for = isinstance(effects, Effects) and effects.camera_gradients
     if not (asked_for or any(t.requires_grad for t in tangents)):
@@ -169,15 +167,16 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
         like: A tensor whose dtype and device the result takes.
     """
     tangents = (settings.tanfovx, settings.tanfovy)
-    if effects.lens is not None and effects.lens.reach is None:
-        center = view_center(settings.viewmatrix, settings.projmatrix, False).tolist()
-        effects = replace(effects, lens=effects.lens.with_reach(map(float, tangents), center))
-    like, members = widened(like), effects.lens_members()
     for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
         _check_tangent(name, tangent)
+    if effects.off_center or effects.lens is not None:
+        center = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
+    if effects.lens is not None:
+        effects = replace(effects, lens=effects.lens.with_reach(tangents, center))
+    like, members = widened(like), effects.lens_members()
     members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
     if effects.off_center or effects.lens is not None:
-        members["center"] = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
+        members["center"] = center
     # Neighbouring numbers are copied to the device together; the last member is never a tensor.
     parts, floats = [], []
     for name, size in _C.LENS:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
 
 from . import _C
 from .lens import Lens
+from .scalars import check_number
 
 MAX_SH_DEGREE = _C.MAX_SH_DEGREE
 NEAR = _C.NEAR  # camera-space z up to which everything is culled
@@ -98,8 +99,8 @@ class Defocus:
     focus: float | torch.Tensor
 
     def __post_init__(self):
-        _check_number("aperture", self.aperture, at_least=0)
-        _check_number("focus", self.focus, above=0)
+        check_number("aperture", self.aperture, at_least=0)
+        check_number("focus", self.focus, above=0)
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class Motion:
     screen_velocity: tuple | torch.Tensor | None = None
 
     def __post_init__(self):
-        _check_number("exposure", self.exposure, at_least=0)
+        check_number("exposure", self.exposure, at_least=0)
         for name, length in (("velocity", 3), ("angular_velocity", 3), ("screen_velocity", 2)):
             value = getattr(self, name)
             if isinstance(value, torch.Tensor):
@@ -138,7 +139,7 @@ class Motion:
             else:
                 fits = value is None or len(value) == length
                 for number in value if value is not None and fits else ():
-                    _check_number(f"every number of {name}", number)
+                    check_number(f"every number of {name}", number)
             if not fits:
                 raise ValueError(f"{name} must have {length} finite numbers, got {value!r}")
 
@@ -219,9 +220,9 @@ class Effects:
             raise TypeError(f"sh_degree must be a whole number or None, got {degree!r}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
-        _check_number("near", self.near, **({"at_least": 0} if self.orthographic else {"above": 0}))
+        check_number("near", self.near, **({"at_least": 0} if self.orthographic else {"above": 0}))
         if isinstance(self.far, torch.Tensor) or self.far != math.inf:
-            _check_number("far", self.far)
+            check_number("far", self.far)
         if not self.far > self.near:
             raise ValueError(f"far must be above near, {self.near}, got {self.far}")
 
@@ -270,18 +271,6 @@ class Effects:
             }
             members |= {k: _times(self.motion.exposure, v) for k, v in velocities.items() if v is not None}
         return members
-
-
-def _check_number(name: str, value, at_least: float = -math.inf, above: float = -math.inf) -> None:
-    if isinstance(value, torch.Tensor):
-        if value.numel() != 1:
-            raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
-        return  # the value is not examined: on a device that would have to be waited for
-    if isinstance(value, bool) or not isinstance(value, Real):  # numpy's are Real too
-        raise TypeError(f"{name} must be a number, got {value!r}")
-    if not (math.isfinite(value) and value >= at_least and value > above):
-        limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
-        raise ValueError(f"{name} must be finite{limit}, got {value}")
 
 
 def _is_integer_tensor(value) -> bool:

@@ -10,6 +10,7 @@ from functools import lru_cache
 import torch
 
 from . import _C
+from .scalars import check_number
 
 SIZE = dict(_C.LENS)["distortion"]
 # By model: how many coefficients there are at most, radial, tangential and thin prism ones, and where each kind begins.
@@ -33,7 +34,8 @@ class Lens:
 
     Attributes:
         model: One of `perspective`, `fisheye`, `rad_tan_fisheye`, `fov`.
-        coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable.
+        coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable, whose values
+            the host reads for every picture.
         reach: Angle from the axis, rad, beyond which the Jacobian is that of a ray at this angle; None: 1.3 times the
             largest (of its tangent, for `perspective` and `fov`) that the picture sees. To find that, the host waits
             for a CUDA device, unless `camera_settings` made the settings.
@@ -57,8 +59,8 @@ class Lens:
         else:
             numbers = _numbers("coefficients", given, SIZE)
             object.__setattr__(self, "coefficients", numbers + (0.0,) * (SIZE - len(numbers)))
-            if self.model == "fov" and not 0 < numbers[0] < math.pi:
-                raise ValueError(f"w of a fov lens must be above 0 and below pi, got {numbers[0]}")
+            if self.model == "fov" and not 0 < self.coefficients[0] < math.pi:
+                raise ValueError(f"w of a fov lens must be above 0 and below pi, got {self.coefficients[0]}")
         if self.reach is not None and not 0 < self.reach <= math.pi:
             raise ValueError(f"reach must be above 0 and at most pi, got {self.reach}")
 
@@ -117,12 +119,13 @@ class Lens:
         """The same with `reach` for a picture, unless it has one.
 
         Args:
-            tangents: tanfovx and tanfovy of the settings.
-            center: x/z and y/z of a pinhole at the middle of the picture.
+            tangents: tanfovx and tanfovy of the settings; numbers or tensors.
+            center: x/z and y/z of a pinhole at the middle of the picture; numbers or tensors.
         """
         if self.reach is not None:
             return self
-        reach = _reach(self.model, self._values(), *map(float, tangents), *map(float, center))
+        numbers = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
+        reach = _reach(self.model, self._values(), *numbers)
         return Lens(self.model, self.coefficients, reach)
 
     @property
@@ -160,10 +163,9 @@ def _numbers(name: str, given, most: int) -> tuple[float, ...]:
     if len(given) > most:
         raise ValueError(f"{name} must have at most {most} numbers, got {len(given)}")
     for number in given:
-        if isinstance(number, (bool, str)) or not hasattr(number, "__float__"):
-            raise TypeError(f"every number of {name} must be a number, got {number!r}")
-        if not math.isfinite(float(number)):
-            raise ValueError(f"every number of {name} must be finite, got {number}")
+        if isinstance(number, torch.Tensor):  # whose gradient would be lost
+            raise TypeError(f"{name} must hold numbers, or coefficients be one tensor, got {number!r}")
+        check_number(f"every number of {name}", number)
     return tuple(float(number) for number in given)
 
 

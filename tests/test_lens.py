@@ -211,6 +211,7 @@ def test_devices_and_precisions_agree(device, lens):
         (lambda: ar.Lens("mirror", (0.0,)), "model must be one of perspective"),
         (lambda: ar.Lens.perspective([0.1] * 7), "radial must have at most 6 numbers, got 7"),
         (lambda: ar.Lens.fisheye([math.nan]), "every number of radial must be finite"),
+        (lambda: ar.Lens("fov", ()), "w of a fov lens must be above 0"),
         (lambda: ar.Lens.fov(0.0), "w of a fov lens must be above 0"),
         (lambda: ar.Lens("fisheye", torch.zeros(3)), r"coefficients must have shape \(12,\), got \(3,\)"),
         (lambda: ar.Effects(lens=ar.Lens.fisheye(), orthographic=True), "lens must be None for an orthographic"),
@@ -227,3 +228,5 @@ def test_a_lens_must_be_one():
         ar.Effects(lens="fisheye")
     with pytest.raises(TypeError, match="radial must be a sequence of numbers"):
         ar.Lens.fisheye(0.1)
+    with pytest.raises(TypeError, match="radial must hold numbers, or coefficients be one tensor"):
+        ar.Lens.fisheye([torch.tensor(0.1, requires_grad=True)])

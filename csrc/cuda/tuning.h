@@ -47,7 +47,8 @@ inline constexpr int kReservedRoom = 1 << 16;
 inline constexpr int kProjectThreads = 128;
 /// Loads of the camera against an even share of Gaussians.
 inline constexpr int kProjectBlocksPerSm = 32;
-/// With six blocks a thread would have 80 registers, and spill. The full camera needs all registers.
+/// With six blocks a thread would have 80 registers, and spill. The full camera has 168 with three, and spills
+/// little; the models of lenses would take more.
 inline constexpr int kProjectVjpBlocks = 5, kFullProjectVjpBlocks = 3;
 /// A whole warp sums splats with more pairs.
 inline constexpr int kManyPairs = 64;

@@ -24,15 +24,16 @@
 //   add_jacobian_vjp
 //   largest_stretch(camera, view)       an upper bound of its norm in camera space
 //
-// Motion and defocus:
+// Motion:
 //
 //   velocity(camera, p, w) -> Vec2      in the image, of a point with velocity w in camera space: by the derivative of
 //                                       the map, without clamps
 //   velocity_vjp(...) -> VelocityGrad
-//   defocus(lens, p)                    signed diameter of the disc of p, over focal length and aperture
-//   defocus_vjp
 //
 // In CameraModelDefaults:
+//
+//   defocus(lens, p)                    signed diameter of the disc of p, over focal length and aperture
+//   defocus_vjp
 //
 //   depth(view)                         orders splats, and is shown; not negative
 //   depth_vjp(...) -> Vec3 dL/dview
@@ -120,10 +121,20 @@ AR_HD void add_focal_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, cons
   to.lens.tan_half_fov.y -= dot(grad.y, j.y) / camera.lens.tan_half_fov.y;
 }
 
-/// Rays meet at the camera's position; the depth is z.
+/// Rays meet at the camera's position; the depth is z, and so is that of a thin lens.
 struct CameraModelDefaults {
   template <typename T> AR_HD static T depth(Vec3<T> view) { return view.z; }
   template <typename T> AR_HD static Vec3<T> depth_vjp(Vec3<T>, T dL_ddepth) { return {T(0), T(0), dL_ddepth}; }
+
+  /// A thin lens: the disc has the diameter f aperture |1/focus - 1/z|.
+  template <typename T> AR_HD static T defocus(const Lens<T>& lens, Vec3<T> p) {
+    return T(1) / lens.focus - T(1) / p.z;
+  }
+  template <typename T>
+  AR_HD static void defocus_vjp(const Lens<T>& lens, Vec3<T> p, T dL_ddefocus, Vec3<T>& dL_dp, Lens<T>& dL_dlens) {
+    dL_dlens.focus -= dL_ddefocus / (lens.focus * lens.focus);
+    dL_dp.z += dL_ddefocus / (p.z * p.z);
+  }
 
   template <typename T> AR_HD static Vec3<T> ray(const Camera<T>& camera, Vec3<T> mean) {
     return mean - camera.position;

@@ -174,16 +174,6 @@ template <class Model> struct PerspectiveLens : LensModel<Model> {
     const T ex = quotient(p.x, rho), ey = quotient(p.y, rho), along = g.x * ex + g.y * ey, scale = quotient(limit, rho);
     return {scale * (g.x - along * ex), scale * (g.y - along * ey), g.z + lens.reach * along};
   }
-
-  /// As of a pinhole.
-  template <typename T> AR_HD static T defocus(const Lens<T>& lens, Vec3<T> p) {
-    return T(1) / lens.focus - T(1) / p.z;
-  }
-  template <typename T>
-  AR_HD static void defocus_vjp(const Lens<T>& lens, Vec3<T> p, T dL_ddefocus, Vec3<T>& dL_dp, Lens<T>& dL_dlens) {
-    dL_dlens.focus -= dL_ddefocus / (lens.focus * lens.focus);
-    dL_dp.z += dL_ddefocus / (p.z * p.z);
-  }
 };
 
 /// For models that see up to all directions: `reach` and `fold` are angles from the axis. The depth is the distance.

@@ -76,16 +76,6 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
     return {{-(gx * w.z * iz), -(gy * w.z * iz), iz * w.z * along - iz * (gx * ux + gy * uy)}, {gx, gy, -along}};
   }
 
-  /// A thin lens: the disc has the diameter f aperture |1/focus - 1/z|.
-  template <typename T> AR_HD static T defocus(const Lens<T>& lens, Vec3<T> p) {
-    return T(1) / lens.focus - T(1) / p.z;
-  }
-  template <typename T>
-  AR_HD static void defocus_vjp(const Lens<T>& lens, Vec3<T> p, T dL_ddefocus, Vec3<T>& dL_dp, Lens<T>& dL_dlens) {
-    dL_dlens.focus -= dL_ddefocus / (lens.focus * lens.focus);
-    dL_dp.z += dL_ddefocus / (p.z * p.z);
-  }
-
  private:
   template <typename T> AR_HD static Vec2<T> clamp_center(const Camera<T>&) { return {T(0), T(0)}; }
   template <typename T> AR_HD static Vec2<T> clamp_center(const FullCamera<T>& camera) { return camera.lens.center; }
