@@ -60,10 +60,10 @@ class Image(NamedTuple):
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
     "large": Image(512, 512, 600),
-    "large, few tiles": Image(512, 512, 18000, opacity=(0.004, 0.2), sigma=(0.001, 0.02), spread=0.04, around=300),
+    "large, few tiles": Image(520, 520, 7000, opacity=(0.004, 0.2), sigma=(0.001, 0.01), spread=0.005, around=900),
     "large, opaque": Image(512, 512, 1500, opacity=(0.3, 0.99), sigma=(0.02, 0.1), spread=0.3),
-    "small": Image(40, 30, 12000, spread=0.3),
-    "small, opaque": Image(40, 30, 1000, opacity=(0.3, 0.99), sigma=(0.1, 0.5)),
+    "small": Image(20, 15, 7000, spread=0.2),
+    "small, opaque": Image(24, 18, 1000, opacity=(0.3, 0.99), sigma=(0.1, 0.5)),
     "pixel": Image(1, 1, 300),
 }
 LARGEST = Image(1024, 1024, 600)
