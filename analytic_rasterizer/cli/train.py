@@ -91,7 +91,7 @@ def add_parser(subcommands) -> None:
     add("--test-every", type=int, metavar="N", help=test_every)
     cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
     add("--cameras", metavar="NAME", help=cameras)
-    lens = "photographs with lens distortion are resampled to pinholes, or an error (default: undistort)"
+    lens = "photographs with a lens are rendered with it, resampled to pinholes, or an error (default: exact)"
     add("--lens", choices=LENS_CHOICES, help=lens)
     missing = "pictures that are not there are an error, or left out with their cameras (default: refuse)"
     add("--missing", choices=MISSING_CHOICES, help=missing)

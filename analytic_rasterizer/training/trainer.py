@@ -206,7 +206,6 @@ class Trainer:
         """The pictures of the next step."""
         count, settings = self.options.pictures_per_step, self._settings()
         first = self.progress.step * count
-        effects = None if self.filter_3d is None else Effects(filter_3d=self.filter_3d)
         shown = []
         for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
@@ -214,8 +213,8 @@ class Trainer:
             if self.random_background:
                 background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
-            if effects is not None:
-                chosen = chosen._replace(effects=effects)
+            if self.filter_3d is not None:
+                chosen = chosen._replace(effects=replace(chosen.effects or Effects(), filter_3d=self.filter_3d))
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
