@@ -112,9 +112,10 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
 
 
 def _interval_of_lens(means3D: torch.Tensor, camera: Any, effects: Effects) -> torch.Tensor:
-    """The same for a camera with a lens, in float64 on the CPU: the inverse of the smaller singular value of the Jacobian.
+    """The same for a camera with a lens, computed in float64 on the CPU.
 
-    That is the interval in the direction in which samples are farthest apart, as z / focal length is for a pinhole.
+    It is the inverse of the Jacobian's smaller singular value: the interval in the direction in which samples are
+    farthest apart, as z / focal length is for a pinhole.
     """
     view = camera.viewmatrix.detach().reshape(4, 4).to("cpu", torch.float64)
     points = widened(means3D.detach()).to("cpu", torch.float64)

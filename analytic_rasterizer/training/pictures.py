@@ -180,7 +180,8 @@ def _tells_orientation(stored: Stored, view: io.View) -> bool:
 def fitted(rgba: Tensor, item: Photograph, multiple: int) -> tuple[io.View, Tensor]:
     """The picture (H, W, 4) of a photograph and its view, cut about the centre to multiples of px.
 
-    It is undistorted if that is wanted. The principal point moves along. Where the picture is not of the size that the view states, the view is scaled.
+    It is undistorted if that is wanted. The principal point moves along. Where the picture is not of the size that the
+    view states, the view is scaled.
 
     Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
