@@ -56,6 +56,8 @@ MAIN = {
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
     "seed": "of everything that is drawn",
     "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
+    "deterministic": "the same bits in every run on CUDA too, also after a sudden rise of pairs; slower, for the host "
+    "waits for every frame (a CPU always gives the same bits)",
     "density": f"density control: {', '.join(DENSITIES)}",
     "max_gaussians": "start with no more than this, and grow no further, evenly towards it; 0: no limit",
     "random_points": "Gaussians at the start where SCENE has no points (default: 100000, or --max-gaussians where that "
