@@ -80,7 +80,7 @@ FACES = [
         (AXES[0], AXES[1]),
         (AXES[0], -AXES[1]),
         (-AXES[0], -AXES[2]),
-    )  # fmt: skip
+    )
 ]
 
 
