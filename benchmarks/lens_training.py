@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from scene_files import load_scene
 from torch import Tensor
 
 import analytic_rasterizer as ar
@@ -89,7 +90,7 @@ class Renderer:
 
     def __init__(self, scene: Gaussians, device: str, footprint: str, background: tuple[float, float, float]):
         self.gaussians = scene.to(device).arguments()
-        self.device, self.footprint, self.background = device, footprint, background
+        self.degree, self.device, self.footprint, self.background = scene.sh_degree, device, footprint, background
 
     @torch.no_grad()
     def photograph(self, view: io.View, rays: Tensor) -> Tensor:
@@ -107,7 +108,7 @@ class Renderer:
             w2c = view.w2c.clone()
             w2c[:3] = axes @ w2c[:3]
             face = replace(view, width=side, height=side, fx=half, fy=half, cx=None, cy=None, w2c=w2c, lens=None)
-            settings = face.settings(1.0, self.background, footprint=self.footprint, device=self.device)
+            settings = face.settings(1.0, self.background, self.degree, self.footprint, device=self.device)
             image, _ = ar.GaussianRasterizer(settings)(means2D=None, **self.gaussians)
             at = torch.stack([x[here] / z[here], y[here] / z[here]], -1) * (2 * half / side)
             seen = torch.nn.functional.grid_sample(image[None], at[None, None], align_corners=False)[0, :, 0]
@@ -155,7 +156,7 @@ def main() -> None:
     add("--seeds", type=int, nargs="+", default=[0])
     add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     args = parser.parse_args()
-    scene = io.load_scene(args.scene)
+    scene = load_scene(args.scene)
     views = [view.scaled(args.scale) for view in io.load_views(args.views)][: args.limit_views]
     if args.wide:
         focal = [view.width / 2 / np.tan(np.radians(args.wide / 2)) for view in views]
