@@ -185,9 +185,9 @@ def main() -> None:
                 iterations=args.iterations, footprint=args.footprint, seed=seed, background=args.background
             )
             out = args.out / f"{name}_{lens}_{seed}"
-            training.Run(args.out / name, out, options, device=args.device, lens=lens).train()
-            metrics = json.loads((out / "metrics.json").read_text())
-            results.setdefault(f"{name}, {lens}", []).append(metrics["mean"]["psnr"])
+            run = training.Run(args.out / name, out, options, device=args.device, lens=lens)
+            run.train()
+            results.setdefault(f"{name}, {lens}", []).append(run.evaluate()["test"]["mean"]["psnr"])
     print("| photographs | PSNR of held-out pinholes, dB |\n|---|---|")
     for row, values in results.items():
         print(f"| {row} | {' '.join(f'{value:.2f}' for value in values)} |")
