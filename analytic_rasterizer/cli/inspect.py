@@ -1,4 +1,4 @@
-"""`inspect`: which effects and which footprint a scene calls for."""
+"""`inspect`: which effects and which footprint a scene calls for, and what a capture calls for before training."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ import shlex
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
+
 from .. import io
 from ..analysis.baking import bake_gain
 from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene
+from ..io.appearance import holds_scene
+from ..training.captures import IMAGES, is_capture
+from ..training.evidence import MOST_PHOTOGRAPHS
+from ..training.plan import plan_capture
 from .arguments import (
     LARGER,
     add_footprint,
@@ -25,24 +31,36 @@ from .arguments import (
 from .scenes import say, settle_views
 
 
+MOST_VIEWS = 8
+TOLERANCE = 1 / 255
+# Options that captures do not have, and their defaults.
+OF_SCENES = dict.fromkeys(("views", "footprint", "training_views", "size", "background", "picture"))
+OF_SCENES |= {"scales": 1.0, "tolerance": TOLERANCE}
+
+
 def add_parser(subcommands) -> None:
     parser = subcommands.add_parser(
         "inspect",
-        help="say which effects and which footprint a scene calls for, and what they cost",
+        help="say which effects and which footprint a scene calls for, and what they cost; or what a capture calls for",
         description="Render SCENE from the views of VIEWS with every effect that it may call for and with a few "
         "footprints, and name the cheapest that stay within the tolerance of everything switched on. Prints what each "
         "effect changes and costs, and what the views show. A scene that was trained with 3DGS, or with the "
-        "footprint point, is baked in memory first, and what that gains is printed.",
+        "footprint point, is baked in memory first, and what that gains is printed. Of a capture, a folder of photographs "
+        "with cameras, it says before any training what lenses, exposures, blur, masks and the like it has, and which "
+        "options of train act on them.",
     )
     add_scene(parser)
     add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
     add_scales(parser, reduction, "of the views: 2 is half the size (default: 1)", 1.0)
     add = parser.add_argument
     rms = "root mean square over a view, in units of colour, 0 to 1 (default: 1/255)"
-    add("--tolerance", type=tolerance, default=1 / 255, metavar="T", help=rms)
+    add("--tolerance", type=tolerance, default=TOLERANCE, metavar="T", help=rms)
     add("--training-views", metavar="FILE", help="views that the scene was trained from, for the 3D filter")
-    views = "look at no more than N views, evenly spread over the file (default: %(default)s)"
-    add("--max-views", type=count, default=8, metavar="N", help=views)
+    views = "look at no more than N views, evenly spread over the file "
+    views += f"(default: {MOST_VIEWS}, of a capture {MOST_PHOTOGRAPHS})"
+    add("--max-views", type=count, metavar="N", help=views)
+    add("--images", metavar="NAME", help=f"of a capture: folder of the photographs (default: {IMAGES})")
+    add("--cameras", metavar="NAME", help="of a capture: file or folder to read the cameras from (default: found)")
     add("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
     picture = "plot what the views show, as .png, .svg or .pdf: sizes of splats"
     add("--picture", metavar="FILE", help=picture)
@@ -50,7 +68,13 @@ def add_parser(subcommands) -> None:
 
 
 def run(args) -> None:
-    """Inspects the scene and prints the report."""
+    """Inspects the scene, or the capture, and prints the report."""
+    if _is_capture(args):
+        _inspect_capture(args)
+        return
+    for name in ("images", "cameras"):
+        if getattr(args, name) is not None:
+            raise ValueError(f"--{name} is for captures, and {args.scene} is none")
     if args.picture:  # raises before anything is rendered
         io.optional_import("matplotlib.figure", "analysis")
         if Path(args.picture).suffix.lower() not in (".png", ".svg", ".pdf"):
@@ -60,7 +84,7 @@ def run(args) -> None:
     trained = found.training_footprint(args.footprint)
     training = None if args.training_views is None else found.load_views(args.training_views, args.size)
     all_views, said = settle_views(args, found)
-    limit = min(len(all_views), args.max_views)
+    limit = min(len(all_views), args.max_views or MOST_VIEWS)
     views = [all_views[i * len(all_views) // limit] for i in range(limit)]
     check_sizes((view.scaled(1 / args.scales) for view in views), args.device, LARGER)
     for path in (args.json, args.picture):
@@ -85,3 +109,32 @@ def run(args) -> None:
     if gain is not None:
         print(f"{gain.to_text()}\n\nwhat follows is for the baked scene: bake {shlex.quote(args.scene)} --out FILE\n")
     print(report.to_text())
+
+
+def _is_capture(args) -> bool:
+    """Whether SCENE is a folder of photographs, and not one of a trained scene."""
+    folder = Path(args.scene)
+    if not folder.is_dir() or holds_scene(folder):
+        return False
+    return args.cameras is not None or args.images is not None or is_capture(folder)
+
+
+def _inspect_capture(args) -> None:
+    """Says what a capture calls for."""
+    given = [name for name, default in OF_SCENES.items() if getattr(args, name) != default]
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')} is for scenes, and {args.scene} is a capture")
+    if args.threads is not None:
+        torch.set_num_threads(args.threads)
+    if args.json not in (None, "-"):
+        check_writable_file(args.json)
+    most = args.max_views or MOST_PHOTOGRAPHS
+    plan = plan_capture(args.scene, args.images or IMAGES, cameras=args.cameras, most=most)
+    say(*plan.notes)
+    if args.json:
+        text = json.dumps(plan.to_json(), indent=1, allow_nan=False) + "\n"
+        if args.json == "-":
+            print(text, end="")
+            return
+        io.write_text(args.json, text)
+    print(plan.to_text())

@@ -244,6 +244,11 @@ def _has_filter_3d(path: Path) -> bool:
     return vertex is not None and FILTER_3D in vertex.names
 
 
+def holds_scene(folder: Path) -> bool:
+    """Whether `find_scene` finds something in a folder."""
+    return (folder / SCENE).is_file() or latest_ply(folder) is not None
+
+
 def _file_in(folder: Path) -> Path:
     """The scene that a folder stands for."""
     own, model = folder / SCENE, latest_ply(folder)

@@ -15,12 +15,15 @@ from .extent import extent_of
 from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
+from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
 from .trainer import Trainer, starting_gaussians
 
 __all__ = [
     "PRESETS",
     "Capture",
+    "CapturePlan",
+    "Finding",
     "Photograph",
     "Pictures",
     "Run",
@@ -32,6 +35,7 @@ __all__ = [
     "load_lpips",
     "load_pictures",
     "load_points",
+    "plan_capture",
     "random_points",
     "save_pictures",
     "starting_gaussians",

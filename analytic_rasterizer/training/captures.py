@@ -105,7 +105,7 @@ def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None
     """The capture in world coordinates, as far as files of cameras and points say. Arguments as `load_capture`."""
 
     def read(place: Path) -> Capture:
-        capture = read_layout(folder, place, images, test_every)
+        capture = read_layout(folder, place, images, test_every)._replace(source=place)
         return _without_missing(capture) if missing == "skip" else capture
 
     if cameras is not None:
@@ -145,9 +145,16 @@ def _without_missing(capture: Capture) -> Capture:
         [item for item in items if all(path.is_file() for path in item.files.values())]
         for items in (capture.train, capture.test)
     )
-    before, after = (len(capture.train) + len(capture.test), len(train) + len(test))
-    notes = () if before == after else (f"{before - after} of {before} pictures are missing and left out",)
-    return capture._replace(train=train, test=test, notes=(*capture.notes, *notes))
+    items = [*capture.train, *capture.test]
+    missing = tuple(path for item in items for path in item.files.values() if not path.is_file())
+    left_out = len(items) - len(train) - len(test)
+    notes = (f"{left_out} of {len(items)} pictures are missing and left out",) if left_out else ()
+    return capture._replace(train=train, test=test, notes=(*capture.notes, *notes), missing=missing)
+
+
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds cameras in one of the layouts, as far as the names of its files tell."""
+    return folder.is_dir() and bool(_places(folder))
 
 
 def _places(folder: Path) -> list[Path]:

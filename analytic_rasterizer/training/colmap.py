@@ -10,7 +10,7 @@ import math
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,6 +57,7 @@ BY_NAME = {model.name: model for model in MODELS}
 
 CAMERAS, IMAGES, POINTS = "cameras", "images", "points3D"
 SUFFIXES = (".bin", ".txt")
+OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 
 
 class Registered(NamedTuple):
@@ -95,7 +96,7 @@ def load_views(folder: Path) -> list[Registered]:
     cameras = {camera: rest for camera, *rest in _cameras(folder)}
     intrinsics: dict = {}
     found = []
-    for file_name, pose, camera in _images(folder):
+    for file_name, pose, camera, _ in _images(folder):
         if camera not in cameras:
             raise io.SceneError(f"{folder}/images: {file_name} was taken by camera {camera}, which cameras lacks")
         if camera not in intrinsics:
@@ -130,25 +131,57 @@ def load_points(folder: Path) -> tuple[Tensor, Tensor] | None:
 
     Raises as `load_views`.
     """
+    path, _, points = _points(folder)
+    finite = _are_finite(points)
+    if not finite.all():
+        left_out = f"{int((~finite).sum())} of {len(points)} points are not finite and left out"
+        warnings.warn(f"{path}: {left_out}", stacklevel=3)
+        points = points[finite]
+    return (points[:, :3].contiguous(), points[:, 3:].float() / 255) if len(finite) else None
+
+
+def load_tracks(folder: Path) -> dict[str, Tensor]:
+    """Which points the matching of COLMAP found in which photographs.
+
+    Returns:
+        By the names of the views of `load_views`: rows of the points of `load_points`, (O,) int64, each once. None is
+        there where the files have no points, or observe none.
+
+    Raises as `load_views`.
+    """
+    path, identifiers, points = _points(folder)
+    identifiers = _whole(path, identifiers)[_are_finite(points).numpy()]
+    order = np.argsort(identifiers, kind="stable")
+    ascending = identifiers[order]
+    observed = {}
+    for file_name, _, _, observations in _images(folder):
+        wanted = np.unique(_whole(f"{folder}/images", observations))
+        place = np.searchsorted(ascending, wanted)
+        place[place == len(ascending)] = 0
+        known = ascending[place] == wanted if len(ascending) else np.zeros(len(wanted), dtype=bool)
+        observed[file_name] = torch.from_numpy(order[place[known]].astype(np.int64))
+    return {item.view.name: observed[item.name] for item in load_views(folder) if len(observed[item.name])}
+
+
+def _points(folder: Path) -> tuple[Path | None, list, Tensor]:
+    """The file of the points, or None; their P identifiers; and positions and colours, (P, 6) float64."""
     preferred = _suffix(folder) or SUFFIXES[0]
     files = (folder / f"{POINTS}{suffix}" for suffix in sorted(SUFFIXES, key=lambda suffix: suffix != preferred))
     path = next((path for path in files if path.is_file()), None)
     if path is None:
-        return None
-    if path.suffix == ".bin":
+        rows = []
+    elif path.suffix == ".bin":
         rows = list(_binary_points(path))
     else:
-        rows = [_floats(path, words[1:7]) for words in _lines(path)]
-        if any(len(row) != 6 for row in rows):
+        rows = [(words[0], *_floats(path, words[1:7])) for words in _lines(path)]
+        if any(len(row) != 7 for row in rows):
             raise io.SceneError(f"{path}: cut short")
-    if not rows:
-        return None
-    points = torch.from_numpy(np.array(rows, dtype=np.float64))
-    finite = points.float().isfinite().all(1)
-    if not finite.all():
-        warnings.warn(f"{path}: {int((~finite).sum())} of {len(rows)} points are not finite and left out", stacklevel=3)
-        points = points[finite]
-    return points[:, :3].contiguous(), points[:, 3:].float() / 255
+    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 6)
+    return path, [row[0] for row in rows], torch.from_numpy(numbers)
+
+
+def _are_finite(points: Tensor) -> Tensor:
+    return points.float().isfinite().all(1)
 
 
 def _cameras(folder: Path) -> Iterator[tuple]:
@@ -158,7 +191,8 @@ def _cameras(folder: Path) -> Iterator[tuple]:
 
 
 def _images(folder: Path) -> Iterator[tuple]:
-    """The picture's name, its pose (a quaternion w, x, y, z and a translation), and its camera."""
+    """The picture's name, its pose (a quaternion w, x, y, z and a translation), its camera, and the identifiers of
+    the points that it observes, as `_whole` takes them."""
     path = folder / f"{IMAGES}{_suffix(folder) or SUFFIXES[0]}"
     return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
 
@@ -181,15 +215,15 @@ def _binary_images(path: Path) -> Iterator[tuple]:
     for _ in range(records.count):
         _, *pose, camera = records.take("i7di")
         file_name = records.text()
-        (observations,) = records.take("Q")
-        records.skip(24 * observations)  # x, y, point
-        yield file_name, pose, camera
+        (count,) = records.take("Q")
+        observations = np.frombuffer(records.data, OBSERVATION, count, records.skip(OBSERVATION.itemsize * count))
+        yield file_name, pose, camera, observations["point"]
 
 
 def _binary_points(path: Path) -> Iterator[list[float]]:
     records = _Records(path)
     for _ in range(records.count):
-        _, *row, _, track = records.take("Q3d3BdQ")
+        *row, _, track = records.take("Q3d3BdQ")
         records.skip(8 * track)  # picture, observation in it
         yield row
 
@@ -240,6 +274,16 @@ def _lines(path: Path) -> Iterator[list[str]]:
     return (line.split() for line in _text_lines(path) if _is_content(line))
 
 
+def _whole(path: Path | str | None, identifiers: Sequence) -> np.ndarray:
+    """Identifiers, numbers or words, as uint64. -1, for what is observed and no point, is as in binary files."""
+    if isinstance(identifiers, np.ndarray):
+        return identifiers
+    try:
+        return np.array([int(word) % 2**64 for word in identifiers], dtype=np.uint64)
+    except ValueError as error:
+        raise io.SceneError(f"{path}: {error}") from None
+
+
 def _floats(path: Path, words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
@@ -272,10 +316,12 @@ def _text_images(path: Path) -> Iterator[tuple]:
         words = line.split(maxsplit=9)
         if len(words) != 10:
             raise io.SceneError(f"{path}: cut short")
-        yield words[9].strip(), _floats(path, words[1:8]), words[8]
         # The observations of a picture are in a second line, which may be empty, and which some programs leave out.
+        observed = []
         if at < len(lines) and not _is_picture(lines[at]):
+            observed = lines[at].split()[2::3] if _is_content(lines[at]) else []
             at += 1
+        yield words[9].strip(), _floats(path, words[1:8]), words[8], observed
 
 
 def _is_picture(line: str) -> bool:

@@ -51,6 +51,8 @@ class Capture(NamedTuple):
             NeRF-synthetic.
         masks: How many pictures have a mask, which is ignored.
         notes: Sentences of what was chosen, for the user.
+        missing: Pictures without a file, whose photographs were left out.
+        source: The file or folder that the cameras come from; None: unknown.
     """
 
     train: list[Photograph]
@@ -61,6 +63,8 @@ class Capture(NamedTuple):
     starts_in_view: bool = False
     masks: int = 0
     notes: tuple[str, ...] = ()
+    missing: tuple[Path, ...] = ()
+    source: Path | None = None
 
 
 def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capture:

@@ -25,7 +25,29 @@ from .options import check_scales
 from .undistortion import without_lens
 
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
+TURNED = range(2, 9)  # its values for the others
 NAMED = 3  # files in a warning
+
+
+class Header(NamedTuple):
+    """What a picture's file says without its pixels."""
+
+    width: int  # px, as stored
+    height: int
+    orientation: int  # as in `Stored`
+
+    def fits(self, view: io.View) -> bool:
+        """Whether the picture can be that of a camera, at this or another scale."""
+        return _is_reduced(self.width, self.height, view.width, view.height)
+
+    def fits_turned(self, view: io.View) -> bool:
+        """Whether it can be after a quarter turn."""
+        return _is_reduced(self.height, self.width, view.width, view.height)
+
+    def tells_orientation(self, view: io.View) -> bool:
+        """Whether it is certainly stored as its camera saw it: EXIF says so, or a quarter turn would not fit."""
+        quarter_turn = self.orientation in (5, 6, 7, 8)
+        return self.orientation not in TURNED or (quarter_turn and not self.fits_turned(view))
 
 
 class Stored(NamedTuple):
@@ -33,6 +55,11 @@ class Stored(NamedTuple):
 
     rgba: Tensor  # (H, W, 4) uint8 of straight alpha
     orientation: int  # how the camera was held, as EXIF counts it
+
+    @property
+    def header(self) -> Header:
+        """Size and orientation."""
+        return Header(self.rgba.shape[1], self.rgba.shape[0], self.orientation)
 
 
 class Pictures(NamedTuple):
@@ -100,7 +127,7 @@ def load_pictures(
     pictures = Pictures([], {scale: [] for scale in scales}, {scale: [] for scale in scales})
     to_turn = []
     for item, files in zip(items, _read_ahead(items, scales)):
-        if not _tells_orientation(files[1], item.view):
+        if not files[1].header.tells_orientation(item.view):
             to_turn.append(item.files[1])
         view, rgba = fitted(files[1].rgba.to(device), item, math.lcm(*scales))
         pictures.views.append(view)
@@ -143,9 +170,18 @@ def _read_files(item: Photograph, scales: tuple[int, ...]) -> dict[int, Stored]:
     return {scale: read_file(item.files[scale]) for scale in {1, *scales} if scale in item.files}
 
 
-def read_file(path: Path) -> Stored:
-    """A picture and its orientation. Raises io.SceneError."""
+def read_file(path: Path, largest: int | None = None) -> Stored:
+    """A picture and its orientation. Raises io.SceneError.
+
+    Args:
+        path: The file.
+        largest: Px of the longer side that are wanted: a .jpg is read at a half, a quarter or an eighth of its size if
+            a reduction by a whole number to no more than that begins with it. None: whole.
+    """
     with opened_picture(path, "train") as opened:
+        if largest is not None:
+            reduction = -(-max(opened.size) // largest)
+            opened.draft(None, tuple(max(1, length // reduction) for length in opened.size))
         if opened.mode != "F" and not opened.mode.startswith("I"):
             return Stored(torch.from_numpy(np.array(opened.convert("RGBA"))), _orientation(opened))
         numbers, orientation = np.array(opened).astype(np.float64), _orientation(opened)
@@ -169,12 +205,10 @@ def _orientation(opened) -> int:
         return UPRIGHT
 
 
-def _tells_orientation(stored: Stored, view: io.View) -> bool:
-    """Whether a picture is certainly stored as its camera saw it: EXIF says so, or a quarter turn would not fit."""
-    quarter_turn = stored.orientation in (5, 6, 7, 8)
-    height, width = stored.rgba.shape[:2]
-    other = _is_reduced(height, width, view.width, view.height)
-    return stored.orientation not in range(2, 9) or (quarter_turn and not other)
+def read_header(path: Path) -> Header:
+    """Raises io.SceneError."""
+    with opened_picture(path, "train") as opened:
+        return Header(*opened.size, _orientation(opened))
 
 
 def fitted(rgba: Tensor, item: Photograph, multiple: int) -> tuple[io.View, Tensor]:
@@ -187,8 +221,8 @@ def fitted(rgba: Tensor, item: Photograph, multiple: int) -> tuple[io.View, Tens
     """
     path, view = item.files[1], item.view
     height, width = rgba.shape[:2]
-    full = view.width, view.height
-    if not _is_reduced(width, height, *full) and _is_reduced(height, width, *full):
+    header = Header(width, height, UPRIGHT)
+    if not header.fits(view) and header.fits_turned(view):
         raise io.SceneError(
             f"{path}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x {height}"
         )

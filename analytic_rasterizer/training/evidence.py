@@ -1,0 +1,277 @@
+"""What the photographs of a capture show of the same points: colours, sharpness, and sampling intervals.
+
+Photographs are compared at the points that they share. What is measured of a point in a photograph is the sum of what
+the point has and of what the photograph adds; medians over points and over photographs in turn separate the two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ..lens import WIDE
+from .layouts import Photograph
+from .pictures import read_file
+
+MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
+MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and points behind which they may be hidden
+LEAST_SEEN = 3  # photographs that see a point: of two nobody knows which is the odd one
+LEAST_COMMON = 20  # points that a photograph shares with others: its median is then right to a third of their spread
+ROUNDS = 5  # of medians in turn; where photographs overlap, the first three do nearly all
+
+# A point is visible where it is about as near as the nearest point in a cell.
+CELL = 8  # px
+DEPTH_TOLERANCE = 1.03  # of the nearest depth
+
+WINDOW = 5  # px, whose mean colour is that of a point, so that half a pixel of a wrong position does not count
+SMOOTH = 0.15  # largest deviation of colours in the window, of their mean. More than that moves with the position
+DARKEST, BRIGHTEST = 10 / 255, 245 / 255  # of colours that are measured: others are noise, or clipped
+# Stops: the largest median deviation of a point over photographs (otherwise it shines, or is not there), and the
+# largest deviation of a single observation.
+CONSISTENT, OUTLYING = 0.25, 1.0
+BAND_WINDOW = 9  # px, over which frequencies are averaged
+LEAST_TEXTURE = 2 / 255  # amplitude of the octave below the finest: in less the finest is noise
+
+
+class Evidence(NamedTuple):
+    """What photographs show of points, with one row for each of O observations.
+
+    Attributes:
+        count: How many photographs there are.
+        points: How many points there are.
+        photograph, point: (O,) int64, which.
+        color: (O, 3) float64, mean stored colours around the point, in [0, 1].
+        roughness: (O,) float64, deviation of the colours around it, of their mean.
+        bands: (O, 2) float64, mean squares of the finest octave of frequencies and of the next.
+        nearest, farthest: (points,) float64, the smallest and the largest size of a pixel of the picture at the point,
+            world units, over the photographs that can see it.
+        seen: (points,) int64, how many photographs can see it.
+        transparent: (count,) bool, whether a picture has pixels that are not opaque.
+    """
+
+    count: int
+    points: int
+    photograph: Tensor
+    point: Tensor
+    color: Tensor
+    roughness: Tensor
+    bands: Tensor
+    nearest: Tensor
+    farthest: Tensor
+    seen: Tensor
+    transparent: Tensor
+
+
+def spread_out(items: Sequence, most: int) -> list:
+    """At most `most` of the items, evenly over their order."""
+    count = min(len(items), most)
+    return [items[i * len(items) // count] for i in range(count)]
+
+
+def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str, Tensor]) -> Evidence:
+    """Reads the photographs, a few at a time, and looks at the points in them.
+
+    Args:
+        items: The photographs, all of which are read.
+        points: (P, 3) float64, in the frame of the views; None where there are none.
+        tracks: Rows of the points that a photograph observes, by the names of views; empty: a test of depths says it.
+
+    Raises io.SceneError for a picture that cannot be read.
+    """
+    points = torch.zeros(0, 3, dtype=torch.float64) if points is None else points.double()
+    step = max(-(-len(points) // MOST_HIDING), 1)
+    points, tracks = points[::step], {name: rows[rows % step == 0] // step for name, rows in tracks.items()}
+    chosen = torch.zeros(len(points), dtype=torch.bool)
+    candidates = torch.arange(len(points))
+    if tracks:
+        rows = torch.cat([tracks[item.view.name] for item in items if item.view.name in tracks] or [candidates[:0]])
+        candidates = (torch.bincount(rows, minlength=len(points)) >= LEAST_SEEN).nonzero()[:, 0]
+    if len(candidates):
+        chosen[candidates[:: -(-len(candidates) // MOST_POINTS)]] = True
+    with ThreadPoolExecutor() as pool:
+        looks = list(pool.map(lambda item: _look(item, points, chosen, tracks), items))
+    observed = [look.observed for look in looks]
+    nearest, farthest = points.new_full((len(points),), math.inf), points.new_zeros(len(points))
+    seen = torch.zeros(len(points), dtype=torch.int64)
+    for look in looks:
+        nearest[look.visible] = torch.minimum(nearest[look.visible], look.intervals)
+        farthest[look.visible] = torch.maximum(farthest[look.visible], look.intervals)
+        seen[look.visible] += 1
+    return Evidence(
+        count=len(items),
+        points=len(points),
+        photograph=torch.arange(len(items)).repeat_interleave(torch.tensor([len(rows) for rows in observed])),
+        point=torch.cat(observed),
+        color=torch.cat([look.sampled[:, :3] for look in looks]),
+        roughness=torch.cat([look.sampled[:, 3] for look in looks]),
+        bands=torch.cat([look.sampled[:, 4:6] for look in looks]),
+        nearest=nearest,
+        farthest=farthest,
+        seen=seen,
+        transparent=torch.tensor([look.transparent for look in looks]),
+    )
+
+
+class _Look(NamedTuple):
+    """At the points in one photograph."""
+
+    transparent: bool
+    visible: Tensor  # (V,) the points that it can see
+    intervals: Tensor  # (V,) sizes of a pixel there
+    observed: Tensor  # (O,) the points whose pixels are measured
+    sampled: Tensor  # (O, 7) of `_maps`
+
+
+def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Tensor]) -> _Look:
+    rgba = read_file(item.files[1], LARGEST).rgba
+    transparent = bool((rgba[:, :, 3] < 255).any())
+    none = torch.zeros(0, dtype=torch.int64)
+    if not len(points):
+        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7))
+    planes = rgba.permute(2, 0, 1)[None].float() / 255
+    reduction = -(-max(rgba.shape[:2]) // LARGEST)
+    planes = functional.avg_pool2d(planes, reduction) if reduction > 1 else planes
+    height, width = planes.shape[2:]
+    view = item.view.resized(width, height)
+    in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
+    pixels = view.pixels_of(in_camera)
+    size = pixels.new_tensor([width, height])
+    inside = ((pixels >= 0) & (pixels < size)).all(1)
+    wide = view.lens is not None and view.lens.model in WIDE
+    depth = in_camera.norm(dim=1) if wide else in_camera[:, 2]
+    visible = inside.nonzero()[:, 0]
+    visible = visible[_in_front(pixels[visible], depth[visible], width, height) & chosen[visible]]
+    observed = visible
+    if tracks:
+        observed = tracks.get(view.name, none)
+        observed = observed[(inside & chosen)[observed]]
+    sampled = _sampled(_maps(planes), pixels[observed], size)
+    opaque = sampled[:, 6] > 0.999
+    intervals = depth[visible] / math.sqrt(view.fx * view.fy)
+    return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque])
+
+
+def _in_front(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
+    """(N,) bool: whether a point is about as near as the nearest in its cell of a picture of this size."""
+    columns, rows = width // CELL + 1, height // CELL + 1
+    column, row = (pixels / CELL).long().unbind(1)
+    cell = row * columns + column
+    nearest = depth.new_full((rows * columns,), math.inf).scatter_reduce(0, cell, depth, "amin")
+    return depth <= DEPTH_TOLERANCE * nearest[cell]
+
+
+def _maps(rgba: Tensor) -> Tensor:
+    """(1, 7, H, W) of (1, 4, H, W): columns of `Evidence` from `color` to `bands`, and alpha."""
+    color = _mean(rgba[:, :3], WINDOW)
+    variance = (_mean(rgba[:, :3].square(), WINDOW) - color.square()).clamp_min(0).mean(1, keepdim=True)
+    roughness = variance.sqrt() / color.mean(1, keepdim=True).clamp_min(DARKEST)
+    grey = rgba[:, :3].mean(1, keepdim=True)
+    # Binomial filters of variance 1 and 4 px^2.
+    fine = _blurred(grey)
+    coarse = _blurred(_blurred(_blurred(fine)))
+    bands = [_mean((above - below).square(), BAND_WINDOW) for above, below in ((grey, fine), (fine, coarse))]
+    return torch.cat([color, roughness, *bands, _mean(rgba[:, 3:], BAND_WINDOW)], 1)
+
+
+def _mean(planes: Tensor, window: int) -> Tensor:
+    for size in ((window, 1), (1, window)):
+        padding = tuple(length // 2 for length in size)
+        planes = functional.avg_pool2d(planes, size, 1, padding, count_include_pad=False)
+    return planes
+
+
+def _blurred(plane: Tensor) -> Tensor:
+    kernel = plane.new_tensor([1, 4, 6, 4, 1]) / 16
+    padded = functional.pad(plane, (2, 2, 2, 2), mode="replicate")
+    return functional.conv2d(functional.conv2d(padded, kernel.view(1, 1, 1, 5)), kernel.view(1, 1, 5, 1))
+
+
+def _sampled(maps: Tensor, pixels: Tensor, size: Tensor) -> Tensor:
+    """(N, C) float64: maps (1, C, H, W), interpolated at pixels (N, 2)."""
+    places = (2 * pixels / size - 1).float()[None, None]  # grid_sample has a picture span [-1, 1]
+    found = functional.grid_sample(maps, places, "bilinear", "border", align_corners=False)
+    return found[0, :, 0].T.double()
+
+
+# ------------------------------------------------------------------------------------ measures
+
+
+def stops_of(evidence: Evidence) -> Tensor:
+    """(count, 3): how much brighter each photograph is in red, green and blue than the others at the same points, in
+    powers of two of linear light; NaN for photographs that share too few points with others."""
+    color = evidence.color
+    good = ((color > DARKEST) & (color < BRIGHTEST)).all(1) & (evidence.roughness < SMOOTH)
+    logs, photograph, point = _linear(color[good]).log2(), evidence.photograph[good], evidence.point[good]
+    for strictness in (0.5, 1, None):  # the first offsets are those with hidden and shining points
+        kept = _shared(photograph, point, evidence)
+        logs, photograph, point = logs[kept], photograph[kept], point[kept]
+        fits = [offsets_of(channel, photograph, point, evidence) for channel in logs.unbind(1)]
+        offsets, levels = (torch.stack(values, 1) for values in zip(*fits))
+        if strictness is not None:
+            deviations = strictness * (logs - offsets[photograph] - levels[point]).abs().amax(1)
+            kept = medians_of(deviations, point, evidence.points)[point] < CONSISTENT
+            kept &= deviations < OUTLYING
+            logs, photograph, point = logs[kept], photograph[kept], point[kept]
+    return offsets
+
+
+def sharpness_of(evidence: Evidence) -> Tensor:
+    """(count,): the share of the finest octave of frequencies of each photograph over that of the others at the same
+    points, in powers of two; NaN for photographs that share too few points with others."""
+    textured = evidence.bands[:, 1] > LEAST_TEXTURE**2
+    photograph, point = evidence.photograph[textured], evidence.point[textured]
+    finest, next_finest = evidence.bands[textured].unbind(1)
+    shares = 0.5 * (finest / next_finest).clamp_min(1e-6).log2()
+    kept = _shared(photograph, point, evidence)
+    return offsets_of(shares[kept], photograph[kept], point[kept], evidence)[0]
+
+
+def interval_ranges(evidence: Evidence) -> Tensor:
+    """(N,): the largest over the smallest sampling interval of every point that several photographs can see."""
+    return (evidence.farthest / evidence.nearest)[evidence.seen >= LEAST_SEEN]
+
+
+def _shared(photograph: Tensor, point: Tensor, evidence: Evidence) -> Tensor:
+    """(O,) bool: observations of points in enough photographs, by photographs with enough such points."""
+    kept = torch.ones_like(point, dtype=torch.bool)
+    for _ in range(2):  # the second time without points of photographs that have too few
+        seen = torch.bincount(point[kept], minlength=evidence.points)
+        kept = kept & (seen[point] >= LEAST_SEEN)
+        common = torch.bincount(photograph[kept], minlength=evidence.count)
+        kept = kept & (common[photograph] >= LEAST_COMMON)
+    return kept
+
+
+def offsets_of(values: Tensor, photograph: Tensor, point: Tensor, evidence: Evidence) -> tuple[Tensor, Tensor]:
+    """What photographs add to values (O,), and what points have: (count,) with the median 0, and (points,); NaN where
+    nothing is known."""
+    offsets = values.new_zeros(evidence.count)
+    for _ in range(ROUNDS):
+        levels = medians_of(values - offsets[photograph], point, evidence.points)
+        offsets = medians_of(values - levels[point], photograph, evidence.count)
+        offsets = offsets - offsets.nanmedian()
+    return offsets, levels
+
+
+def medians_of(values: Tensor, group: Tensor, count: int) -> Tensor:
+    """(count,): the median of the values (O,) of each group (O,); NaN for groups without any."""
+    order = values.argsort(stable=True)
+    order = order[group[order].argsort(stable=True)]
+    sizes = torch.bincount(group, minlength=count)
+    first = sizes.cumsum(0) - sizes
+    medians = values.new_full((count,), math.nan)
+    there = sizes > 0
+    low, high = ((first + half)[there] for half in ((sizes - 1) // 2, sizes // 2))
+    medians[there] = (values[order[low]] + values[order[high]]) / 2
+    return medians
+
+
+def _linear(stored: Tensor) -> Tensor:
+    """Light of stored values, by the curve of sRGB."""
+    return torch.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)

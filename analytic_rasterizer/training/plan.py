@@ -1,0 +1,356 @@
+"""What a capture calls for, by its files and photographs, before anything is trained: `inspect CAPTURE`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import io
+from . import colmap
+from .captures import IMAGES, TEST_PERIOD, check_capture, read_cameras
+from .evidence import (
+    LARGEST,
+    LEAST_SEEN,
+    MOST_PHOTOGRAPHS,
+    Evidence,
+    gather,
+    interval_ranges,
+    sharpness_of,
+    spread_out,
+    stops_of,
+)
+from .extent import outliers_of
+from .layouts import Capture, Photograph
+from .pictures import TURNED, read_header
+from .placement import offset_of
+
+YES, NO, NOT_KNOWN = "yes", "no", "not known"
+"""Verdicts: whether a capture has an effect to an extent that matters."""
+
+LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
+# Spreads up to which they are noise, and beyond which they are none, by whether tracks say what is visible. Projected
+# points are hidden at times: bonsai, of a fixed exposure, has 0.19 stops and 7% with them, and 0.36 stops where every
+# second photograph is 0.5 stops brighter.
+EXPOSURE = {True: (0.15, 0.15), False: (0.15, 0.25)}  # stops
+WHITE_BALANCE = {True: (5.0, 5.0), False: (5.0, 15.0)}  # percent
+MIDDLE = 0.1  # of photographs that a spread leaves out: some see few points
+BLUR = 0.4  # octaves: sharp captures have up to 0.33 (bonsai), a blur of 1 px has 0.46 to 1
+ALIASED, SEVERAL_SCALES = 1.5, 4.0  # ranges of sampling intervals
+ALIASED_SHARE, SCALES_SHARE = 0.1, 0.05  # of the points: single ones are reconstructed at a wrong place
+GRID = 17  # points along each side of a picture, where lenses are measured
+NAMED = 5  # photographs in a line
+
+SCALES = "1,2,4,8"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect of a capture.
+
+    Attributes:
+        effect: Its name.
+        number: What was measured; None: nothing could be, or it is not finite.
+        unit: Of the number.
+        verdict: YES, NO or NOT_KNOWN: whether the effect matters here.
+        option: Of `train`, with its value, that acts on it; "" where there is none, or none is needed.
+        reason: What the number is, and what follows.
+        photographs: Names of files that it is about.
+    """
+
+    effect: str
+    number: float | None
+    unit: str
+    verdict: str
+    option: str
+    reason: str
+    photographs: tuple[str, ...] = ()
+
+    def to_text(self) -> str:
+        """One line."""
+        shown = "" if self.number is None else f"{self.number:.3g} {self.unit} "
+        named = ", ".join(self.photographs[:NAMED]) + (", .." if len(self.photographs) > NAMED else "")
+        parts = [f"{shown}{self.reason}", named, self.option]
+        return f"{self.effect:<16} {self.verdict:<9}  {'; '.join(filter(None, parts))}"
+
+
+@dataclass(frozen=True)
+class CapturePlan:
+    """What a capture calls for.
+
+    Attributes:
+        capture: Its folder.
+        photographs: How many it has, missing ones not among them.
+        looked_at: How many of them were read.
+        findings: One for each effect.
+        notes: What was chosen among what the folder holds, as `Capture.notes`.
+    """
+
+    capture: str
+    photographs: int
+    looked_at: int
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def options(self) -> dict[str, str]:
+        """Options of `train` that the capture calls for, and their values: {"exposure": "affine"}."""
+        chosen = (finding.option.removeprefix("--").split(" ") for finding in self.findings if finding.verdict == YES)
+        return {words[0]: words[1] for words in chosen if len(words) == 2}
+
+    def to_lines(self) -> list[str]:
+        """A line of what was looked at, then one for each finding: the first lines of `train`."""
+        looked = f"looked at {self.looked_at} of {self.photographs} photographs, at up to {LARGEST} px"
+        return [f"{self.capture}: {looked}", *(finding.to_text() for finding in self.findings)]
+
+    def to_text(self) -> str:
+        """`to_lines`, and the options."""
+        options = " ".join(f"--{name} {value}" for name, value in self.options.items())
+        return "\n".join([*self.to_lines(), f"calls for: {options or 'nothing special'}"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON holds it."""
+        return {**asdict(self), "options": self.options}
+
+
+def plan_capture(
+    folder,
+    images: str = IMAGES,
+    test_every: int = TEST_PERIOD,
+    *,
+    cameras: str | None = None,
+    most: int = MOST_PHOTOGRAPHS,
+) -> CapturePlan:
+    """Looks at a capture: its cameras, its points, the headers of all pictures, and the pixels of some.
+
+    Args:
+        folder, images, test_every, cameras: As of `load_capture`.
+        most: Pictures that are read, evenly spread over the capture. Their longer side is reduced to at most LARGEST
+            px.
+
+    Raises:
+        io.SceneError: As `load_capture`, but for missing pictures and lenses; a picture that cannot be read.
+        OSError: A file that cannot be read.
+        ValueError: `most` is not positive.
+    """
+    if most < 1:
+        raise ValueError(f"most must be at least 1, got {most}")
+    folder = Path(folder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # findings say it
+        capture = read_cameras(folder, images, test_every, cameras, "skip")
+    check_capture(folder, capture)
+    items = sorted([*capture.train, *capture.test], key=lambda item: str(item.files[1]))
+    points = None if capture.points is None else capture.points[0]
+    outliers = outliers_of([item.view for item in items], points)
+    kept = [item for place, item in enumerate(items) if place not in outliers]
+    looked_at = spread_out(kept, most)
+    from_colmap = points is not None and capture.source is not None and capture.source.is_dir()
+    tracks = colmap.load_tracks(capture.source) if from_colmap else {}
+    evidence = gather(looked_at, points, tracks)
+    findings = (
+        _lens(items),
+        *_colors(evidence, bool(tracks)),
+        _intervals(evidence),
+        _scales(evidence, kept),
+        _blur(evidence, looked_at),
+        _masks(capture, len(items)),
+        _alpha(evidence, looked_at),
+        *_files(items),
+        _missing(capture, folder),
+        _outlying(items, outliers),
+        _far([item.view for item in kept], points),
+    )
+    return CapturePlan(str(folder), len(items), len(looked_at), findings, capture.notes)
+
+
+def _unknown(effect: str, unit: str, reason: str) -> Finding:
+    return Finding(effect, None, unit, NOT_KNOWN, "", reason)
+
+
+def _names(items: Sequence[Photograph]) -> tuple[str, ...]:
+    return tuple(item.files[1].name for item in items)
+
+
+# ------------------------------------------------------------------------------------ geometry
+
+
+def displacement_of(view: io.View) -> float:
+    """How far from where a pinhole would show it a lens shows something, px: the most inside the picture.
+
+    Infinite where the picture shows what is 90 degrees or more from the axis. 0 without a lens.
+    """
+    if view.lens is None:
+        return 0.0
+    x, y = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (view.width, view.height))
+    pixels = torch.cartesian_prod(x, y)
+    rays = view.rays_of(pixels)
+    shown = rays.isfinite().all(1)
+    rays, pixels = rays[shown], pixels[shown]
+    if (rays[:, 2] <= 0).any():
+        return math.inf
+    moved = pixels - io.View(
+        "pinhole", view.width, view.height, view.fx, view.fy, view.w2c, view.cx, view.cy
+    ).pixels_of(rays)
+    return moved.norm(dim=1).max().item() if len(rays) else 0.0
+
+
+def _lens(items: list[Photograph]) -> Finding:
+    with_lens = [item for item in items if item.view.lens is not None]
+    if not with_lens:
+        return Finding("lens", 0.0, "px", NO, "", "for all cameras are pinholes")
+    distinct = {(v.lens, v.width, v.height, v.fx, v.fy, v.middle): v for v in (item.view for item in with_lens)}
+    largest = max(displacement_of(view) for view in spread_out(list(distinct.values()), MOST_PHOTOGRAPHS))
+    models = ", ".join(sorted({item.view.lens.model for item in with_lens}))
+    which = f"{len(with_lens)} of {len(items)} photographs have a lens ({models})"
+    if math.isinf(largest):
+        reason = f"{which}, and show more than a half space, which no pinhole does"
+        return Finding("lens", None, "px", YES, "--lens exact", reason)
+    needed = largest > LENS
+    reason = f"is the largest displacement from a pinhole; {which}"
+    return Finding("lens", largest, "px", YES if needed else NO, "--lens exact" if needed else "", reason)
+
+
+def _intervals(evidence: Evidence) -> Finding:
+    effect, unit = "sampling", "% of points"
+    ranges = interval_ranges(evidence)
+    if not len(ranges):
+        return _unknown(effect, unit, _why_unknown(evidence))
+    share = (ranges > ALIASED).double().mean().item()
+    needed = share >= ALIASED_SHARE
+    reason = f"have sampling intervals that differ by more than {ALIASED:g} (median {ranges.median():.2f})"
+    reason += ": integrate over pixels, as the default footprint does" if needed else ""
+    return Finding(effect, 100 * share, unit, YES if needed else NO, "", reason)
+
+
+def _scales(evidence: Evidence, items: list[Photograph]) -> Finding:
+    effect, unit = "scales", "% of points"
+    stored = sorted({scale for item in items for scale in item.files})
+    if len(stored) > 1:
+        scales = ",".join(map(str, stored))
+        return Finding(effect, len(stored), "sizes", YES, f"--scales {scales}", "of each picture are in the capture")
+    ranges = interval_ranges(evidence)
+    if not len(ranges):
+        return _unknown(effect, unit, _why_unknown(evidence))
+    share = (ranges > SEVERAL_SCALES).double().mean().item()
+    needed = share >= SCALES_SHARE
+    reason = f"have sampling intervals that differ by more than {SEVERAL_SCALES:g}"
+    return Finding(effect, 100 * share, unit, YES if needed else NO, f"--scales {SCALES}" if needed else "", reason)
+
+
+def _outlying(items: list[Photograph], outliers: dict[int, float]) -> Finding:
+    effect, unit = "outlying cameras", "photographs"
+    if len(items) < 3:
+        return _unknown(effect, unit, "fewer than 3 photographs")
+    reason = "have a camera far from all others" + (", and are left out" if outliers else "")
+    found = _names([items[place] for place in outliers])
+    return Finding(effect, len(outliers), unit, YES if outliers else NO, "", reason, found)
+
+
+def _far(views: list[io.View], points: torch.Tensor | None) -> Finding:
+    offset = offset_of(views, points)
+    distance = 0.0 if offset is None else math.hypot(*offset)
+    reason = "need no offset" if offset is None else "from zero, which are taken off, and written to the files"
+    return Finding("far from zero", distance, "world units", NO if offset is None else YES, "", reason)
+
+
+# ------------------------------------------------------------------------------------ pixels
+
+
+def _why_unknown(evidence: Evidence) -> str:
+    if not evidence.points:
+        return "the capture has no points"
+    return f"too few points are in {LEAST_SEEN} photographs that were looked at"
+
+
+def _colors(evidence: Evidence, tracked: bool) -> tuple[Finding, Finding]:
+    units = {"exposure": "stops", "white balance": "%"}
+    stops = stops_of(evidence)
+    known = stops.isfinite().all(1)
+    count = int(known.sum())
+    if count < LEAST_SEEN:
+        reason = _why_unknown(evidence) if not evidence.points else "too few smooth points are seen several times"
+        return tuple(_unknown(effect, unit, reason) for effect, unit in units.items())
+    stops = stops[known]
+    exposures = stops.mean(1, keepdim=True)
+    balance = _spread(stops - exposures).max().item()
+    numbers = {"exposure": _spread(exposures).item(), "white balance": 100 * (2**balance - 1)}
+    limits = {"exposure": EXPOSURE[tracked], "white balance": WHITE_BALANCE[tracked]}
+    source = "tracks" if tracked else "projected points"
+    found = []
+    for effect, number in numbers.items():
+        noise, least = limits[effect]
+        verdict = YES if number > least else NO if number <= noise else NOT_KNOWN
+        reason = f"to either side of the middle, at the same points ({count} photographs, {source})"
+        if verdict == NOT_KNOWN:
+            reason += "; without tracks this may be hidden points"
+        option = "--exposure affine" if verdict == YES else ""
+        found.append(Finding(effect, number, units[effect], verdict, option, reason))
+    return tuple(found)
+
+
+def _spread(offsets: torch.Tensor) -> torch.Tensor:
+    """Half the range of columns, without the outer tenth of the rows."""
+    low, high = torch.quantile(offsets, offsets.new_tensor([MIDDLE / 2, 1 - MIDDLE / 2]), dim=0)
+    return (high - low) / 2
+
+
+def _blur(evidence: Evidence, items: list[Photograph]) -> Finding:
+    effect, unit = "blur", "photographs"
+    sharpness = sharpness_of(evidence)
+    known = int(sharpness.isfinite().sum())
+    if known < LEAST_SEEN:
+        reason = "too few textured points are seen several times" if evidence.points else _why_unknown(evidence)
+        return _unknown(effect, unit, reason)
+    blurred = [place for place in sharpness.argsort().tolist() if sharpness[place] < -BLUR]
+    least = 2 ** sharpness[sharpness.isfinite()].min().item()
+    reason = f"of {known} have less of the finest details than others at the same points, down to {least:.0%}"
+    names = _names([items[place] for place in blurred])
+    return Finding(effect, len(blurred), unit, YES if blurred else NO, "", reason, names)
+
+
+def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
+    found = [item for item, transparent in zip(items, evidence.transparent.tolist()) if transparent]
+    reason = f"of {len(items)} looked at are transparent somewhere" + (
+        ": the background shows through" if found else ""
+    )
+    return Finding("alpha", len(found), "photographs", YES if found else NO, "", reason)
+
+
+# ------------------------------------------------------------------------------------ files
+
+
+def _masks(capture: Capture, count: int) -> Finding:
+    verdict, option = (YES, "--masks auto") if capture.masks else (NO, "")
+    return Finding("masks", capture.masks, "masks", verdict, option, f"for {count} photographs")
+
+
+def _missing(capture: Capture, folder: Path) -> Finding:
+    names = tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in capture.missing)
+    verdict, option = (YES, "--missing skip") if names else (NO, "")
+    return Finding("missing pictures", len(names), "files", verdict, option, "are not there", names)
+
+
+def _files(items: list[Photograph]) -> tuple[Finding, Finding]:
+    """Turns that EXIF asks for, and pictures that do not have the shape of their camera's."""
+    with ThreadPoolExecutor() as pool:
+        headers = list(pool.map(lambda item: read_header(item.files[1]), items))
+    pairs = list(zip(items, headers))
+    turned = [item for item, header in pairs if header.orientation in TURNED]
+    open_ones = sum(not header.tells_orientation(item.view) for item, header in pairs)
+    reason = "are to be turned by EXIF, and used as stored"
+    if turned:
+        reason += f"; the sizes of {open_ones} do not tell whether that fits the camera"
+    turns = Finding("EXIF turns", len(turned), "photographs", YES if turned else NO, "", reason, _names(turned))
+    wrong = [item for item, header in pairs if not header.fits(item.view)]
+    quarter = sum(header.fits_turned(item.view) for item, header in pairs if not header.fits(item.view))
+    reason = "do not have the proportions of their camera"
+    if wrong:
+        reason += f"; {quarter} do after a quarter turn, which train refuses; it stretches the camera of the others"
+    return turns, Finding("wrong sizes", len(wrong), "photographs", YES if wrong else NO, "", reason, _names(wrong))

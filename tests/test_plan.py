@@ -1,0 +1,325 @@
+"""What a capture calls for: captures that are made with an effect, and without."""
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+from conftest import SHARED
+
+from analytic_rasterizer import Lens, cli, io
+
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+
+from capture_files import looking_at_origin, quaternion, write_colmap_text  # noqa: E402
+
+from analytic_rasterizer.training import colmap, evidence, plan  # noqa: E402
+from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
+from analytic_rasterizer.training.plan import NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
+
+COUNT, SIZE, HALF = 10, (160, 120), 3.0  # photographs, px, half the width of the wall that they show
+
+
+def texture(x, y) -> np.ndarray:
+    """(.., 3) colours of a wall at (x, y) in linear light, of several octaves, smooth enough to be measured."""
+    x, y = (np.asarray(value, dtype=np.float64)[..., None] for value in (x, y))
+    phase = np.array([0.0, 0.7, 1.9])
+    found = 0.25 + 0.02 * np.sin(3 * x + phase) * np.cos(2 * y + phase)
+    for frequency in (17, 37, 61, 83):
+        found = found + 0.02 * np.sin(frequency * x + phase) * np.cos(0.9 * frequency * y - phase)
+    return found
+
+
+def stored(light) -> np.ndarray:
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def photograph(view, gain=(1.0, 1.0, 1.0), blur=0) -> np.ndarray:
+    """(H, W, 3) uint8 of the wall z = 0, averaged over 3x3 samples of a pixel."""
+    samples = 3
+    x, y = ((torch.arange(samples * size, dtype=torch.float64) + 0.5) / samples for size in (view.width, view.height))
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), 2).reshape(-1, 2)
+    c2w = torch.linalg.inv(view.w2c)
+    rays = view.rays_of(pixels) @ c2w[:3, :3].T
+    hit = c2w[:3, 3] - rays * (c2w[2, 3] / rays[:, 2])[:, None]
+    shape = view.height, samples, view.width, samples, 3
+    light = texture(*hit[:, :2].T.numpy()).reshape(shape).mean((1, 3)) * np.array(gain)
+    planes = torch.from_numpy(stored(light)).permute(2, 0, 1)[:, None]
+    for _ in range(blur):
+        planes = evidence._blurred(planes)
+    return (255 * planes[:, 0].permute(1, 2, 0)).round().to(torch.uint8).numpy()
+
+
+def cameras(distance=lambda i: 4.0, lens=None) -> list:
+    angles = [0.08 * (i - COUNT / 2) for i in range(COUNT)]
+    poses = [looking_at_origin(angle, distance(i)) for i, angle in enumerate(angles)]
+    return [io.View(f"p_{i}", *SIZE, 180.0, 180.0, pose, lens=lens) for i, pose in enumerate(poses)]
+
+
+def wall_points(count=600) -> tuple[torch.Tensor, torch.Tensor]:
+    xy = 2 * torch.rand(count, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 1
+    points = torch.cat([HALF / 2 * xy, torch.zeros(count, 1, dtype=torch.float64)], 1)
+    return points, torch.from_numpy(255 * stored(texture(*points[:, :2].T.numpy()))).round().to(torch.uint8)
+
+
+def write_tracked(folder, views, points, colors, tracked=True, model=1, coefficients=()) -> None:
+    """A reconstruction of which every photograph observes every point that it shows, or none."""
+    folder.mkdir(parents=True)
+    files = {name: [struct.pack("<Q", len(rows))] for name, rows in (("cameras", views), ("images", views))}
+    for i, view in enumerate(views):
+        numbers = (view.fx, view.fy, *view.middle, *coefficients)
+        files["cameras"].append(struct.pack(f"<iiQQ{len(numbers)}d", i, model, view.width, view.height, *numbers))
+        pose = (*quaternion(view.w2c[:3, :3]), *view.w2c[:3, 3].tolist())
+        pixels = view.pixels_of(points @ view.w2c[:3, :3].T + view.w2c[:3, 3])
+        shown = ((pixels >= 0) & (pixels < torch.tensor(SIZE))).all(1) & tracked
+        seen = shown.nonzero()[:, 0].tolist()
+        rows = [struct.pack("<ddq", *pixels[row].tolist(), 5 * row + 2) for row in seen] + [
+            struct.pack("<ddq", 1, 1, -1)
+        ]
+        files["images"].append(struct.pack("<i7di", i, *pose, i) + f"{view.name}.png".encode() + b"\0")
+        files["images"].append(struct.pack("<Q", len(rows)) + b"".join(rows))
+    files["points3D"] = [struct.pack("<Q", len(points))]
+    for row, (point, color) in enumerate(zip(points.tolist(), colors.tolist())):
+        files["points3D"].append(struct.pack("<Q3d3BdQ", 5 * row + 2, *point, *color, 0.5, 0))
+    for name, parts in files.items():
+        (folder / f"{name}.bin").write_bytes(b"".join(parts))
+
+
+def write_wall(folder, views=None, tracked=True, gains=None, blurred=(), shift=(0, 0, 0), points=True, **camera):
+    """A capture of the wall. Pictures are those of `views`, whose world is then shifted."""
+    views = cameras() if views is None else views
+    (folder / "images").mkdir(parents=True)
+    for i, view in enumerate(views):
+        gain = (1, 1, 1) if gains is None else gains(i)
+        picture = photograph(view, gain, 1 if i in blurred else 0)
+        image.fromarray(picture).save(folder / "images" / f"{view.name}.png")
+    xyz, colors = wall_points() if points else (torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3))
+    world = [view.in_frame(tuple(-float(s) for s in shift)) for view in views]
+    write_tracked(folder / "sparse" / "0", world, xyz + torch.tensor(shift), colors, tracked, **camera)
+    return folder
+
+
+def findings(found) -> dict:
+    return {finding.effect: finding for finding in found.findings}
+
+
+def plan_of(folder, **options) -> dict:
+    return findings(plan_capture(folder, test_every=0, **options))
+
+
+EVEN = {"lens", "exposure", "white balance", "scales", "blur", "masks", "alpha", "EXIF turns", "wrong sizes"}
+EVEN |= {"missing pictures", "outlying cameras", "far from zero", "sampling"}
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_an_even_capture_calls_for_nothing(tmp_path, tracked):
+    found = plan_capture(write_wall(tmp_path / "wall", tracked=tracked))
+    assert {name: finding.verdict for name, finding in findings(found).items()} == dict.fromkeys(EVEN, NO)
+    assert found.options == {} and "nothing special" in found.to_text()
+    assert findings(found)["exposure"].number < 0.02 and findings(found)["white balance"].number < 1
+    assert len(found.to_lines()) == 1 + len(EVEN)
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_exposure(tmp_path, tracked):
+    found = plan_of(write_wall(tmp_path / "wall", tracked=tracked, gains=lambda i: (2 ** (0.5 - i % 2),) * 3))
+    assert found["exposure"].verdict == YES and found["exposure"].option == "--exposure affine"
+    assert found["exposure"].number == pytest.approx(0.5, abs=0.03)
+    assert found["white balance"].verdict == NO
+    assert found["blur"].verdict == NO
+
+
+def test_white_balance(tmp_path):
+    found = plan_of(write_wall(tmp_path / "wall", gains=lambda i: (1.2, 1, 1 / 1.2) if i % 2 else (1, 1, 1)))
+    assert found["white balance"].verdict == YES and found["white balance"].option == "--exposure affine"
+    assert found["white balance"].number == pytest.approx(100 * (math.sqrt(1.2) - 1), abs=1)
+    assert found["exposure"].verdict == NO
+
+
+def test_blurred_photographs_are_named(tmp_path):
+    found = plan_of(write_wall(tmp_path / "wall", blurred=(3, 7)))
+    assert found["blur"].verdict == YES and found["blur"].number == 2
+    assert set(found["blur"].photographs) == {"p_3.png", "p_7.png"}
+    assert found["exposure"].verdict == NO
+
+
+def test_sampling_intervals_and_scales(tmp_path):
+    """From 2 to 3.6 away intervals differ by 1.8, from 1 to 6 by 6."""
+    found = plan_of(write_wall(tmp_path / "some", cameras(lambda i: 2 + 1.6 * (i % 2))))
+    assert found["sampling"].verdict == YES and found["scales"].verdict == NO
+    found = plan_of(write_wall(tmp_path / "many", cameras(lambda i: 1 + 5 * (i % 2))))
+    assert found["scales"].verdict == YES and found["scales"].option == "--scales 1,2,4,8"
+
+
+def test_no_points(tmp_path):
+    """What points tell is not known then, and what files tell is."""
+    found = plan_of(write_wall(tmp_path / "wall", points=False))
+    unknown = {name for name, finding in found.items() if finding.verdict == NOT_KNOWN}
+    assert unknown == {"exposure", "white balance", "sampling", "scales", "blur"}
+    assert all(found[name].reason == "the capture has no points" and found[name].number is None for name in unknown)
+
+
+def test_lens(tmp_path):
+    lens = Lens.perspective((-0.05,))
+    views = cameras(lens=lens)
+    folder = write_wall(tmp_path / "wall", views, model=4, coefficients=(-0.05, 0, 0, 0))
+    found = plan_of(folder)["lens"]
+    assert found.verdict == YES and found.option == "--lens exact"
+    corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
+    ray = views[0].rays_of(corner)[0]
+    pinhole = 180 * ray[:2] / ray[2] + torch.tensor([80.0, 60.0])
+    assert found.number == pytest.approx(pinhole.norm().item(), rel=1e-6) and found.number > 1
+
+
+def test_displacement_of_lenses():
+    view = io.View("v", 100, 80, 50.0, 50.0, torch.eye(4, dtype=torch.float64))
+    assert displacement_of(view) == 0
+    assert displacement_of(io.View("v", 100, 80, 50.0, 50.0, view.w2c, lens=Lens.perspective())) < 1e-6
+    assert displacement_of(io.View("v", 200, 200, 50.0, 50.0, view.w2c, lens=Lens.fisheye())) == math.inf
+
+
+def test_files(tmp_path):
+    """A far camera, a mask, alpha, a turn, a missing picture, and coordinates like those of UTM."""
+    views = cameras()
+    far = views[4].w2c.clone()
+    far[2, 3] = 4000.0
+    folder = write_wall(tmp_path / "wall", views, shift=(4e5, 5e6, 0))
+    views[4] = io.View("p_4", *SIZE, 180.0, 180.0, far)
+    write_tracked(folder / "moved", [v.in_frame((-4e5, -5e6, 0.0)) for v in views], *shifted(wall_points()))
+    (folder / "images" / "p_2.png").unlink()
+    (folder / "masks").mkdir()
+    image.new("L", SIZE).save(folder / "masks" / "p_1.png.png")
+    picture = image.open(folder / "images" / "p_5.png").convert("RGBA")
+    picture.putpixel((3, 3), (0, 0, 0, 0))
+    picture.save(folder / "images" / "p_5.png")
+    turned = image.open(folder / "images" / "p_6.png")
+    exif = turned.getexif()
+    exif[0x0112] = 6
+    turned.save(folder / "images" / "p_6.png", exif=exif)
+    image.open(folder / "images" / "p_7.png").resize((120, 160)).save(folder / "images" / "p_7.png")
+    whole = plan_capture(folder, test_every=0, cameras="moved")
+    found = findings(whole)
+    expected = {
+        "outlying cameras": (1, ("p_4.png",), ""),
+        "masks": (1, (), "--masks auto"),
+        "alpha": (1, (), ""),
+        "EXIF turns": (1, ("p_6.png",), ""),
+        "wrong sizes": (1, ("p_7.png",), ""),
+        "missing pictures": (1, ("images/p_2.png",), "--missing skip"),
+    }
+    for effect, (number, names, option) in expected.items():
+        finding = found[effect]
+        assert (finding.number, finding.photographs, finding.option) == (number, names, option), effect
+        assert finding.verdict == YES, effect
+    assert found["far from zero"].verdict == YES and found["far from zero"].number == pytest.approx(
+        math.hypot(4e5, 5e6)
+    )
+    assert "1 do after a quarter turn" in found["wrong sizes"].reason
+    assert whole.options == {"masks": "auto", "missing": "skip"}
+    assert (whole.photographs, whole.looked_at) == (9, 8)
+
+
+def shifted(points) -> tuple[torch.Tensor, torch.Tensor]:
+    return points[0] + torch.tensor([4e5, 5e6, 0.0], dtype=torch.float64), points[1]
+
+
+def test_no_more_photographs_are_read_than_asked_for(tmp_path, monkeypatch):
+    read = []
+    usual = evidence.read_file
+    monkeypatch.setattr(evidence, "read_file", lambda path, largest: read.append(path.name) or usual(path, largest))
+    found = plan_capture(write_wall(tmp_path / "wall"), most=4)
+    assert sorted(read) == ["p_0.png", "p_2.png", "p_5.png", "p_7.png"]
+    assert (found.photographs, found.looked_at) == (10, 4)
+    with pytest.raises(ValueError, match="most must be at least 1, got 0"):
+        plan_capture(tmp_path / "wall", most=0)
+
+
+def test_tracks(tmp_path):
+    """Rows of points, of which those that are not finite are left out, by the names of views."""
+    points, colors = wall_points(20)
+    points[4, 1] = math.nan
+    write_tracked(tmp_path / "sparse", cameras()[:3], points, colors)
+    tracks = colmap.load_tracks(tmp_path / "sparse")
+    kept, _ = (None, None)
+    with pytest.warns(UserWarning, match="1 of 20 points are not finite"):
+        kept, _ = colmap.load_points(tmp_path / "sparse")
+    for view in cameras()[:3]:
+        pixels = view.pixels_of(kept @ view.w2c[:3, :3].T + view.w2c[:3, 3])
+        shown = ((pixels >= 0) & (pixels < torch.tensor(SIZE))).all(1)
+        assert torch.equal(tracks[view.name].sort().values, shown.nonzero()[:, 0])
+
+
+def test_tracks_of_texts(tmp_path):
+    views = cameras()[:2]
+    write_colmap_text(tmp_path / "text", views, *wall_points(3))
+    assert colmap.load_tracks(tmp_path / "text") == {}
+    path = tmp_path / "text" / "images.txt"
+    path.write_text(path.read_text().replace("1.0 2.0 -1", "1.0 2.0 2 3.5 4.5 -1 5 6 0 7 8 99"))
+    assert {name: rows.tolist() for name, rows in colmap.load_tracks(tmp_path / "text").items()} == {"p_1": [0, 2]}
+    path.write_text(path.read_text().replace("1.0 2.0 2", "1.0 2.0 x"))
+    with pytest.raises(io.SceneError, match="invalid literal"):
+        colmap.load_tracks(tmp_path / "text")
+    assert len(colmap.load_views(tmp_path / "text")) == 2  # which do not need them
+
+
+def test_medians():
+    values = torch.tensor([5.0, 1.0, 2.0, 9.0, 4.0], dtype=torch.float64)
+    found = medians_of(values, torch.tensor([2, 0, 2, 2, 0]), 4)
+    assert found[[0, 2]].tolist() == [2.5, 5.0] and found[[1, 3]].isnan().all()
+
+
+def test_inspect_of_a_capture(tmp_path, capsys):
+    folder = write_wall(tmp_path / "wall", gains=lambda i: (2 ** (0.5 - i % 2),) * 3)
+    out = tmp_path / "plan.json"
+    assert cli.main(["inspect", str(folder), "--json", str(out), "--max-views", "8"]) == 0
+    text = capsys.readouterr().out
+    assert "looked at 8 of 10 photographs" in text and text.endswith("calls for: --exposure affine\n")
+    data = json.loads(out.read_text())
+    assert data["options"] == {"exposure": "affine"} and len(data["findings"]) == len(EVEN)
+    assert set(data["findings"][0]) == {"effect", "number", "unit", "verdict", "option", "reason", "photographs"}
+    assert cli.main(["inspect", str(folder), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["photographs"] == 10
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--views", "views.json"], "--views is for scenes, and wall is a capture"),
+        (["--scales", "2"], "--scales is for scenes, and wall is a capture"),
+        (["--cameras", "sparse/7"], "sparse/7: no such file or folder of cameras"),
+        (["--images", "photos"], "photos: no such folder"),
+        (["--json", "."], ".: expected a file for the results, got a folder"),
+    ],
+)
+def test_errors_of_a_capture_are_one_line(tmp_path, capsys, monkeypatch, extra, message):
+    write_wall(tmp_path / "wall")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["inspect", "wall", *extra]) == 2
+    err = capsys.readouterr().err
+    assert message in err and err.count("\n") == 1
+
+
+def test_a_broken_picture_is_named(tmp_path, capsys):
+    folder = write_wall(tmp_path / "wall")
+    path = folder / "images" / "p_1.png"
+    path.write_bytes(path.read_bytes()[:200])
+    assert cli.main(["inspect", str(folder)]) == 2
+    assert "p_1.png: unreadable or cut short" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "exposure", "blurred"), [("mouse", YES, True), ("bonsai", NOT_KNOWN, False), ("fox", YES, False)]
+)
+def test_real_captures(name, exposure, blurred):
+    """A phone's exposure varies in mouse and fox; that of bonsai is fixed, but its files have no tracks to tell so."""
+    folder = SHARED / "data" / name
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    found = plan_of(folder, most=24)
+    assert found["exposure"].verdict == exposure
+    assert (found["blur"].number > 0) == blurred
+    assert found["lens"].verdict == found["scales"].verdict == NO
+    assert plan.plan_capture is plan_capture
