@@ -30,7 +30,6 @@ from .arguments import (
 )
 from .scenes import say, settle_views
 
-
 MOST_VIEWS = 8
 TOLERANCE = 1 / 255
 # Options that captures do not have, and their defaults.
