@@ -44,8 +44,8 @@ def add_parser(subcommands) -> None:
         description="Render SCENE from the views of VIEWS with every effect that it may call for and with a few "
         "footprints, and name the cheapest that stay within the tolerance of everything switched on. Prints what each "
         "effect changes and costs, and what the views show. A scene that was trained with 3DGS, or with the "
-        "footprint point, is baked in memory first, and what that gains is printed. Of a capture, a folder of photographs "
-        "with cameras, it says before any training what lenses, exposures, blur, masks and the like it has, and which "
+        "footprint point, is baked in memory first, and what that gains is printed. Of a folder of photographs with "
+        "cameras it says, before any training, what lenses, exposures, blur, masks and the like they have, and which "
         "options of train act on them.",
     )
     add_scene(parser)
