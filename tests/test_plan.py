@@ -18,7 +18,8 @@ from capture_files import looking_at_origin, quaternion, write_colmap_text  # no
 
 from analytic_rasterizer.training import colmap, evidence  # noqa: E402
 from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
-from analytic_rasterizer.training.plan import NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
+from analytic_rasterizer.training.pictures import Stored  # noqa: E402
+from analytic_rasterizer.training.plan import EXPOSURE, NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
 
 COUNT, SIZE, HALF = 10, (160, 120), 3.0  # photographs, px, half the width of the wall that they show
 
@@ -315,15 +316,40 @@ def test_a_broken_picture_is_named(tmp_path, capsys):
     assert "p_1.png: unreadable or cut short" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("name", "exposure", "blurred"), [("mouse", YES, True), ("bonsai", NOT_KNOWN, False), ("fox", YES, False)]
-)
-def test_real_captures(name, exposure, blurred):
-    """A phone's exposure varies in mouse and fox; that of bonsai is fixed, but its files have no tracks to tell so."""
+def real_capture(name):
     folder = SHARED / "data" / name
     if not folder.is_dir():
         pytest.skip(f"needs {folder}")
-    found = plan_of(folder, most=24)
-    assert found["exposure"].verdict == exposure
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "exposure", "blurred"),
+    [("mouse", {YES}, True), ("bonsai", {NO, NOT_KNOWN}, False), ("fox", {YES, NOT_KNOWN}, False)],
+)
+def test_real_captures(name, exposure, blurred):
+    """A phone's exposure varies in mouse and fox; that of bonsai looks even. Only the files of mouse have tracks."""
+    found = plan_of(real_capture(name), most=24)
+    assert found["exposure"].verdict in exposure
     assert (found["blur"].number > 0) == blurred
     assert found["lens"].verdict == found["scales"].verdict == NO
+
+
+def test_real_photographs_with_effects(monkeypatch):
+    """Every second photograph of bonsai a stop brighter than the others, and one in ten blurred by 1 px."""
+    folder, usual = real_capture("bonsai"), evidence.read_file
+    items = evidence.spread_out(sorted((folder / "images").iterdir()), 20)
+    blurred = {path.name for path in items[3::10]}
+
+    def changed(path, largest):
+        rgba = usual(path, largest).rgba.permute(2, 0, 1)[:, None].double() / 255
+        light = evidence._linear(rgba[:3]) * 2 ** (0.5 - items.index(path) % 2)
+        planes = torch.cat([torch.from_numpy(stored(light.numpy())), rgba[3:]])
+        planes = evidence._blurred(planes) if path.name in blurred else planes
+        return Stored((255 * planes[:, 0].permute(1, 2, 0)).round().to(torch.uint8), 1)
+
+    monkeypatch.setattr(evidence, "read_file", changed)
+    found = plan_of(folder, most=20)
+    noise = max(EXPOSURE[False])  # without tracks
+    assert found["exposure"].verdict == YES and found["exposure"].number == pytest.approx(0.5, abs=noise)
+    assert set(found["blur"].photographs) == blurred and len(blurred) == 2

@@ -125,7 +125,7 @@ class _Look(NamedTuple):
     visible: Tensor  # (V,) the points that it can see
     intervals: Tensor  # (V,) sizes of a pixel there
     observed: Tensor  # (O,) the points whose pixels are measured
-    sampled: Tensor  # (O, 7) of `_maps`
+    sampled: Tensor  # (O, 7) of `_sampled`
 
 
 def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Tensor]) -> _Look:
@@ -141,8 +141,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     view = item.view.resized(width, height)
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
     pixels = view.pixels_of(in_camera)
-    size = pixels.new_tensor([width, height])
-    inside = ((pixels >= 0) & (pixels < size)).all(1)
+    inside = ((pixels >= 0) & (pixels < pixels.new_tensor([width, height]))).all(1)
     wide = view.lens is not None and view.lens.model in WIDE
     depth = in_camera.norm(dim=1) if wide else in_camera[:, 2]
     visible = inside.nonzero()[:, 0]
@@ -151,8 +150,8 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     if tracks:
         observed = tracks.get(view.name, none)
         observed = observed[(inside & chosen)[observed]]
-    sampled = _sampled(_maps(planes), pixels[observed], size)
-    opaque = sampled[:, 6] > 0.999
+    sampled = _sampled(planes, pixels[observed])
+    opaque = sampled[:, 6] == 1
     intervals = depth[visible] / math.sqrt(view.fx * view.fy)
     return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque])
 
@@ -166,37 +165,37 @@ def _in_front(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     return depth <= DEPTH_TOLERANCE * nearest[cell]
 
 
-def _maps(rgba: Tensor) -> Tensor:
-    """(1, 7, H, W) of (1, 4, H, W): columns of `Evidence` from `color` to `bands`, and alpha."""
-    color = _mean(rgba[:, :3], WINDOW)
-    variance = (_mean(rgba[:, :3].square(), WINDOW) - color.square()).clamp_min(0).mean(1, keepdim=True)
-    roughness = variance.sqrt() / color.mean(1, keepdim=True).clamp_min(DARKEST)
-    grey = rgba[:, :3].mean(1, keepdim=True)
+def _sampled(planes: Tensor, pixels: Tensor) -> Tensor:
+    """(N, 7) float64 at pixels (N, 2) of planes (1, 4, H, W): columns of `Evidence` from `color` to `bands`, and
+    whether all around is opaque."""
+    colors = _around(planes[:, :3], pixels, WINDOW)
+    mean, variance = colors.mean(2), colors.var(2, unbiased=False).mean(1)
+    roughness = variance.sqrt() / mean.mean(1).clamp_min(DARKEST)
+    grey = planes[:, :3].mean(1, keepdim=True)
     # Binomial filters of variance 1 and 4 px^2.
     fine = _blurred(grey)
     coarse = _blurred(_blurred(_blurred(fine)))
-    bands = [_mean((above - below).square(), BAND_WINDOW) for above, below in ((grey, fine), (fine, coarse))]
-    return torch.cat([color, roughness, *bands, _mean(rgba[:, 3:], BAND_WINDOW)], 1)
+    bands = _around(torch.cat([grey - fine, fine - coarse], 1), pixels, BAND_WINDOW).square().mean(2)
+    opaque = _around(planes[:, 3:], pixels, BAND_WINDOW).amin(2) == 1
+    return torch.cat([mean, roughness[:, None], bands, opaque], 1)
 
 
-def _mean(planes: Tensor, window: int) -> Tensor:
-    for size in ((window, 1), (1, window)):
-        padding = tuple(length // 2 for length in size)
-        planes = functional.avg_pool2d(planes, size, 1, padding, count_include_pad=False)
+def _around(planes: Tensor, pixels: Tensor, window: int) -> Tensor:
+    """(N, C, window^2) float64: planes (1, C, H, W) in squares about pixels (N, 2), continued beyond the border."""
+    height, width = planes.shape[2:]
+    steps = torch.arange(window) - window // 2
+    column, row = pixels.long().unbind(1)
+    rows = (row[:, None, None] + steps[:, None]).clamp(0, height - 1)
+    columns = (column[:, None, None] + steps).clamp(0, width - 1)
+    return planes[0].flatten(1)[:, (rows * width + columns).flatten(1)].transpose(0, 1).double()
+
+
+def _blurred(planes: Tensor) -> Tensor:
+    """Planes (N, C, H, W) after a binomial filter of variance 1 px^2, continued beyond the border."""
+    for dim, padding in ((2, (0, 0, 2, 2)), (3, (2, 2, 0, 0))):
+        length, padded = planes.shape[dim], functional.pad(planes, padding, mode="replicate")
+        planes = sum(weight / 16 * padded.narrow(dim, i, length) for i, weight in enumerate((1, 4, 6, 4, 1)))
     return planes
-
-
-def _blurred(plane: Tensor) -> Tensor:
-    kernel = plane.new_tensor([1, 4, 6, 4, 1]) / 16
-    padded = functional.pad(plane, (2, 2, 2, 2), mode="replicate")
-    return functional.conv2d(functional.conv2d(padded, kernel.view(1, 1, 1, 5)), kernel.view(1, 1, 5, 1))
-
-
-def _sampled(maps: Tensor, pixels: Tensor, size: Tensor) -> Tensor:
-    """(N, C) float64: maps (1, C, H, W), interpolated at pixels (N, 2)."""
-    places = (2 * pixels / size - 1).float()[None, None]  # grid_sample has a picture span [-1, 1]
-    found = functional.grid_sample(maps, places, "bilinear", "border", align_corners=False)
-    return found[0, :, 0].T.double()
 
 
 # ------------------------------------------------------------------------------------ measures
