@@ -16,7 +16,7 @@ image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
 from capture_files import looking_at_origin, quaternion, write_colmap_text  # noqa: E402
 
-from analytic_rasterizer.training import colmap, evidence  # noqa: E402
+from analytic_rasterizer.training import colmap, evidence, plan  # noqa: E402
 from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
 from analytic_rasterizer.training.pictures import Stored  # noqa: E402
 from analytic_rasterizer.training.plan import EXPOSURE, NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
@@ -114,7 +114,7 @@ def findings(found) -> dict:
 
 
 def plan_of(folder, **options) -> dict:
-    return findings(plan_capture(folder, test_every=0, **options))
+    return findings(plan_capture(folder, **options))
 
 
 EVEN = {"lens", "exposure", "white balance", "scales", "blur", "masks", "alpha", "EXIF turns", "wrong sizes"}
@@ -188,6 +188,32 @@ def test_displacement_of_lenses():
     assert displacement_of(io.View("v", 200, 200, 50.0, 50.0, view.w2c, lens=Lens.fisheye())) == math.inf
 
 
+def test_more_than_a_half_space(tmp_path):
+    """A lens that no pinhole comes near to has no displacement that JSON holds."""
+    view = io.View("v", 200, 200, 50.0, 50.0, torch.eye(4, dtype=torch.float64), lens=Lens.fisheye())
+    found = plan._lens([plan.Photograph(view, {1: tmp_path / "v.png"})])
+    assert (found.number, found.verdict, found.option) == (None, YES, "--lens exact")
+    assert "1 of 1 photographs have a lens (fisheye)" in found.to_text()
+
+
+def test_pictures_of_several_sizes(tmp_path):
+    """As in the multi-scale Blender set, which names them in metadata.json."""
+    rows = {key: [] for key in ("file_path", "cam2world", "width", "height", "focal")}
+    for i, view in enumerate(cameras()[:3]):
+        c2w = torch.linalg.inv(view.w2c)
+        c2w[:3, 1:3] *= -1
+        for scale in (1, 2, 4):
+            name = f"{i}_{scale}.png"
+            image.new("RGBA", (64 // scale, 64 // scale), (9, 9, 9, 255)).save(tmp_path / name)
+            for key, value in zip(rows, (name, c2w.tolist(), 64 // scale, 64 // scale, 70 / scale)):
+                rows[key].append(value)
+    (tmp_path / "metadata.json").write_text(json.dumps({"train": rows, "test": {key: [] for key in rows}}))
+    found = plan_of(tmp_path)
+    assert (found["scales"].verdict, found["scales"].number) == (YES, 3)
+    assert found["scales"].option == "--scales 1,2,4"
+    assert found["alpha"].verdict == NO and found["sampling"].verdict == NOT_KNOWN
+
+
 def test_files(tmp_path):
     """A far camera, a mask, alpha, a turn, a missing picture, and coordinates like those of UTM."""
     views = cameras()
@@ -207,7 +233,7 @@ def test_files(tmp_path):
     exif[0x0112] = 6
     turned.save(folder / "images" / "p_6.png", exif=exif)
     image.open(folder / "images" / "p_7.png").resize((120, 160)).save(folder / "images" / "p_7.png")
-    whole = plan_capture(folder, test_every=0, cameras="moved")
+    whole = plan_capture(folder, cameras="moved")
     found = findings(whole)
     expected = {
         "outlying cameras": (1, ("p_4.png",), ""),
@@ -226,7 +252,7 @@ def test_files(tmp_path):
     )
     assert "1 do after a quarter turn" in found["wrong sizes"].reason
     assert whole.options == {"masks": "auto", "missing": "skip"}
-    assert (whole.photographs, whole.looked_at) == (9, 8)
+    assert (whole.photographs, whole.looked_at) == (9, 7)  # neither the far camera, nor what does not fit
 
 
 def shifted(points) -> tuple[torch.Tensor, torch.Tensor]:

@@ -21,6 +21,7 @@ from .pictures import read_file
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
 MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and points behind which they may be hidden
+READERS = 8  # threads, each of which holds a whole picture for a moment
 LEAST_SEEN = 3  # photographs that see a point: of two nobody knows which is the odd one
 LEAST_COMMON = 20  # points that a photograph shares with others: its median is then right to a third of their spread
 ROUNDS = 5  # of medians in turn; where photographs overlap, the first three do nearly all
@@ -94,7 +95,7 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         candidates = (torch.bincount(rows, minlength=len(points)) >= LEAST_SEEN).nonzero()[:, 0]
     if len(candidates):
         chosen[candidates[:: -(-len(candidates) // MOST_POINTS)]] = True
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(READERS) as pool:
         looks = list(pool.map(lambda item: _look(item, points, chosen, tracks), items))
     observed = [look.observed for look in looks]
     nearest, farthest = points.new_full((len(points),), math.inf), points.new_zeros(len(points))

@@ -14,7 +14,7 @@ import torch
 
 from .. import io
 from . import colmap
-from .captures import IMAGES, TEST_PERIOD, check_capture, read_cameras
+from .captures import IMAGES, check_capture, read_cameras
 from .evidence import (
     LARGEST,
     LEAST_SEEN,
@@ -28,7 +28,7 @@ from .evidence import (
 )
 from .extent import outliers_of
 from .layouts import Capture, Photograph
-from .pictures import TURNED, read_header
+from .pictures import TURNED, Header, read_header
 from .placement import offset_of
 
 YES, NO, NOT_KNOWN = "yes", "no", "not known"
@@ -122,7 +122,6 @@ class CapturePlan:
 def plan_capture(
     folder,
     images: str = IMAGES,
-    test_every: int = TEST_PERIOD,
     *,
     cameras: str | None = None,
     most: int = MOST_PHOTOGRAPHS,
@@ -130,7 +129,7 @@ def plan_capture(
     """Looks at a capture: its cameras, its points, the headers of all pictures, and the pixels of some.
 
     Args:
-        folder, images, test_every, cameras: As of `load_capture`.
+        folder, images, cameras: As of `load_capture`.
         most: Pictures that are read, evenly spread over the capture. Their longer side is reduced to at most LARGEST
             px.
 
@@ -144,13 +143,17 @@ def plan_capture(
     folder = Path(folder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # findings say it
-        capture = read_cameras(folder, images, test_every, cameras, "skip")
+        capture = read_cameras(folder, images, 0, cameras, "skip")
     check_capture(folder, capture)
     items = sorted([*capture.train, *capture.test], key=lambda item: str(item.files[1]))
     points = None if capture.points is None else capture.points[0]
     outliers = outliers_of([item.view for item in items], points)
     kept = [item for place, item in enumerate(items) if place not in outliers]
-    looked_at = spread_out(kept, most)
+    with ThreadPoolExecutor() as pool:
+        files = [item.files[1] for item in items]
+        headers = dict(zip(files, pool.map(read_header, files)))
+    fitting = [item for item in kept if headers[item.files[1]].fits(item.view)]
+    looked_at = spread_out(fitting or kept, most)
     from_colmap = points is not None and capture.source is not None and capture.source.is_dir()
     tracks = colmap.load_tracks(capture.source) if from_colmap else {}
     evidence = gather(looked_at, points, tracks)
@@ -162,7 +165,7 @@ def plan_capture(
         _blur(evidence, looked_at),
         _masks(capture, len(items)),
         _alpha(evidence, looked_at),
-        *_files(items),
+        *_files([(item, headers[item.files[1]]) for item in items]),
         _missing(capture, folder),
         _outlying(items, outliers),
         _far([item.view for item in kept], points),
@@ -337,11 +340,8 @@ def _missing(capture: Capture, folder: Path) -> Finding:
     return Finding("missing pictures", len(names), "files", verdict, option, "are not there", names)
 
 
-def _files(items: list[Photograph]) -> tuple[Finding, Finding]:
+def _files(pairs: list[tuple[Photograph, Header]]) -> tuple[Finding, Finding]:
     """Turns that EXIF asks for, and pictures that do not have the shape of their camera's."""
-    with ThreadPoolExecutor() as pool:
-        headers = list(pool.map(lambda item: read_header(item.files[1]), items))
-    pairs = list(zip(items, headers))
     turned = [item for item, header in pairs if header.orientation in TURNED]
     open_ones = sum(not header.tells_orientation(item.view) for item, header in pairs)
     reason = "are to be turned by EXIF, and used as stored"
