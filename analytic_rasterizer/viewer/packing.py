@@ -11,6 +11,7 @@ import torch
 from .. import io
 from ..footprints import (
     DILATED,
+    FASTEST,
     NEAREST_TO_EXACT,
     PAPER,
     Footprint,
@@ -21,6 +22,10 @@ from ..footprints import (
     stated,
 )
 from ..gaussians import Gaussians
+
+
+MOVING = "moving"
+"""kPage of footprints whose samples move."""
 
 
 def _page_entry(name: str) -> dict[str, Any]:
@@ -37,6 +42,7 @@ def _page_entry(name: str) -> dict[str, Any]:
         "samples": samples,
         "variance": of_header["variance"],
         "option": of_header["option"] if of_header["value"] is None else None,
+        "instead": FASTEST if samples > 1 or of_header["page"] == MOVING else None,
     }
 
 
