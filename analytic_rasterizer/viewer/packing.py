@@ -14,15 +14,14 @@ from ..footprints import (
     FASTEST,
     NEAREST_TO_EXACT,
     PAPER,
+    RECOMMENDED,
     Footprint,
     footprint_variants,
     get_default_footprint,
     resolve_footprint,
-    sampled_footprints,
     stated,
 )
 from ..gaussians import Gaussians
-
 
 MOVING = "moving"
 """kPage of footprints whose samples move."""
@@ -67,8 +66,9 @@ class PackedScene:
             cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
             and up (a unit vector). `footprints` is what the page offers: name, text for people, family (the name
             without options) and whether it is the family's default, kind (kPage of its header), samples, variance of
-            its Gaussians [px^2], and the name of its option where that is another variance. `compared` are two of
-            their names, what the key C compares with.
+            its Gaussians [px^2], and the name of its option where that is another variance. `instead` is what is drawn
+            while the camera moves, and where there is no WebGPU; null: the footprint itself. `compared` are names of
+            footprints that the key C compares with: the first that can be drawn and is not chosen.
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
@@ -109,11 +109,7 @@ def nearest_page_footprint(footprint: Footprint) -> Footprint:
         page_footprint(footprint)
         return footprint
     except PageFootprintError:
-        if str(footprint) not in sampled_footprints():
-            return resolve_footprint(NEAREST_TO_EXACT)
-        # As many samples that move are as near as more that do not.
-        drawn = [resolve_footprint(name) for name in sampled_footprints() if name in PAGE_FOOTPRINTS]
-        return next((other for other in drawn if other.samples > footprint.samples), drawn[-1])
+        return resolve_footprint(NEAREST_TO_EXACT)
 
 
 def pack_scene(
@@ -167,7 +163,7 @@ def pack_scene(
         "sh_degree": scene.sh_degree,
         "footprint": chosen_name,
         "footprints": list(PAGE_ENTRIES),
-        "compared": [DILATED, PAPER],
+        "compared": [DILATED, RECOMMENDED, PAPER],
         "background": [float(value) for value in background],
         "views": [_view_entry(view) for view in views],
         "center": center.tolist(),

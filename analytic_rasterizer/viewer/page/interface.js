@@ -72,7 +72,7 @@ export class Interface {
     element('footprint').replaceChildren(...options());
     element('compare').replaceChildren(new Option('nothing', ''), ...options());
     const lacks = all.some(footprint => !renderer.draws(footprint));
-    element('renderer').textContent = `${renderer.name} draws${reason && `: ${reason}`}` +
+    element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
       `${lacks ? ' Footprints of several samples need WebGPU.' : ''}` +
       `${renderer.bits === 8 ? ' It has 8 bits per channel: colours are off by up to 6 of 255 levels.' : ''}`;
   }
@@ -180,7 +180,8 @@ export class Interface {
       c: () => {
         const now = state.compare === null ? 'off' : state.mode;
         const next = COMPARISONS[(COMPARISONS.indexOf(now) + 1) % COMPARISONS.length];
-        const other = compared.find(name => name !== state.footprint);
+        const other = compared.find(
+          name => name !== state.footprint && viewer.renderer.draws(viewer.footprint(name)));
         viewer.change(next === 'off' ? { compare: null } : { compare: state.compare ?? other, mode: next });
       },
       z: () => viewer.change({ divisor: DIVISORS[(DIVISORS.indexOf(state.divisor) + 1) % DIVISORS.length] }),

@@ -22,8 +22,8 @@ async function renderView(viewer, k, footprint, width, height) {
     canvas.style.width = `${pinhole.width}px`;
     canvas.style.height = `${pinhole.height}px`;
     try {
-      await renderer.draw({ camera: pinhole, pictures: [{ name: 'left', footprint: parsed }], settled: true });
-      renderer.present({ left: 'left', background: meta.background });
+      await renderer.draw({ camera: pinhole, pictures: [{ name: 'asked', footprint: parsed }], settled: true });
+      renderer.present({ left: 'asked', background: meta.background });
       return pinhole;
     } catch (error) {
       if (!await viewer.wasLost(renderer)) throw error;
@@ -38,7 +38,7 @@ async function bench(viewer, camera, rounds) {
   for (let round = -1; round < rounds; ++round) {  // the first compiles shaders and is not counted
     for (const footprint of footprints) {
       const start = performance.now();
-      await renderer.draw({ camera, pictures: [{ name: 'left', footprint }], settled: false });
+      await renderer.draw({ camera, pictures: [{ name: 'asked', footprint }], settled: false });
       if (round >= 0) times[footprint.name].push(performance.now() - start);
     }
   }
@@ -69,7 +69,7 @@ async function main() {
   await viewer.load(await loadScene(viewer.meta, part => announce(`Loading the scene: ${Math.round(100 * part)}%`)));
   announce('');
   hideFailure();
-  window.analyticPixels = () => viewer.renderer.read('left', viewer.meta.background);
+  window.analyticPixels = () => viewer.renderer.read('asked', viewer.meta.background);
   window.analyticRender = (...view) => renderView(viewer, ...view);
   const asked = automation(given);
   if (asked === null) {

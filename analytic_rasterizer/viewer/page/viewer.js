@@ -212,6 +212,7 @@ export class Viewer {
     this.again = this.drawing;
     if (!this.controls || this.frameRequested || this.drawing || this.renderer.isLost) return;  // or automation
     this.frameRequested = true;
+    this.surface.ariaBusy = 'true';
     requestAnimationFrame(() => this.frame());
   }
 
@@ -271,6 +272,7 @@ export class Viewer {
     const active = this.moving || this.journey || this.controls.flight();
     if (done) this.noteTime(start, active);
     if (active || this.again || !done) this.wake();
+    else if (!this.shown.moving) this.surface.ariaBusy = 'false';  // what is shown is what is asked for
   }
 
   /// Moves along a journey, or with the keys that are held.
@@ -307,7 +309,7 @@ export class Viewer {
     const start = performance.now(), cancelled = () => !moving && this.moving;
     if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
     if (moving) pace.note(performance.now() - start);
-    this.shown = { left: 'left', right: right === null ? null : 'right', camera };
+    this.shown = { left: 'left', right: right === null ? null : 'right', camera, moving };
     this.present();
     return true;
   }

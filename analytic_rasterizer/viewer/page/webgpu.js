@@ -40,6 +40,7 @@ export class WebGPURenderer {
     this.pictures = new Map();
     this.rate = null;    // ms for a sample of a pair
     this.pairs = null;   // of the last picture
+    this.turn = Promise.resolve();
     this.isLost = false;
     this.lost = device.lost.then(() => { this.isLost = true; });
     this.returned = Promise.resolve();
@@ -78,7 +79,13 @@ export class WebGPURenderer {
 
   /// Draws pictures, each {name, footprint, span}, of which the columns from span[0] on up to span[1] are needed [px].
   /// False if `cancelled` has become true; there is no picture then.
-  async draw({ camera, pictures, cancelled = () => false }) {
+  draw(request) {
+    const drawn = this.turn.then(() => this.drawNow(request));
+    this.turn = drawn.catch(() => {});  // buffers are for one picture at a time
+    return drawn;
+  }
+
+  async drawNow({ camera, pictures, cancelled = () => false }) {
     for (const { name, footprint, span = [0, camera.width] } of pictures) {
       const picture = this.picture(name, camera), [, rows] = tilesOf(camera);
       const region = [Math.floor(span[0] / TILE), 0, Math.ceil(span[1] / TILE), rows];
