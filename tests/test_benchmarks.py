@@ -13,6 +13,7 @@ import sys
 import types
 from typing import Any, NamedTuple
 
+import pages
 import pytest
 import scenes
 import torch
@@ -20,7 +21,7 @@ from conftest import ROOT, python_path
 from processes import DEADLINE
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import io, viewer
+from analytic_rasterizer import io
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.dialects import DIALECTS
 from analytic_rasterizer.dialects.gsplat import rasterization
@@ -612,12 +613,12 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
     for scene in (given, [job]):
         out = run(*scene, *rounds)
         results = json.loads(written.read_text())
-        assert list(results["differences"]) == list(viewer.PAGE_FOOTPRINTS)
+        assert list(results["differences"]) == list(pages.WEBGL_FOOTPRINTS)
         for name, of_bits in results["differences"].items():
             assert f"| {name} " in out
             # Some devices cut half floats off where others round.
             assert of_bits["32-bit floats"]["largest"] <= 1 and of_bits["16-bit floats"]["largest"] <= 2
-        count = len(viewer.PAGE_FOOTPRINTS)
+        count = len(pages.WEBGL_FOOTPRINTS)
         assert [row["size"] for row in results["rows"]] == ["40x30"] * count + ["20x15"] * count
         for row in results["rows"]:
             assert row["rounds"] == 2 and row["clock_ms"] > 0 and row["clock_ratio"] > 0

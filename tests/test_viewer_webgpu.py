@@ -4,7 +4,6 @@ Skipped where chromium or playwright is missing (`make test-browser` installs bo
 software.
 """
 
-import itertools
 from dataclasses import replace
 from io import BytesIO
 
