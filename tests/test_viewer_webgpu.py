@@ -140,8 +140,8 @@ def test_a_scene_that_is_too_large_for_webgpu_is_drawn_without(browser):
     with serve(random_scene(20), [facing()]) as server, open_gpu(browser, server, init=init) as page:
         wait_for_frame(page)
         expected = (
-            "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics of "
-            "degree 3. Footprints of several samples need WebGPU."
+            "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics "
+            "of degree 3. Footprints of several samples need WebGPU."
         )
         assert page.text_content("#renderer") == expected
 
