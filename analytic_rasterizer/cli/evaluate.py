@@ -159,7 +159,7 @@ def run_on(ranks: Ranks, args) -> None:
     if ranks.is_first:
         views = [view.name for view in pictures.views]
         written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
-        written["resampled"] = sum(item.lens is not None for item in capture.test)
+        written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
         print(format_results(results, protocol.scales))

@@ -56,6 +56,8 @@ MAIN = {
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
     "seed": "of everything that is drawn",
     "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
+    "deterministic": "the same bits in every run on CUDA too, also after a sudden rise of pairs; slower, for the host "
+    "waits for every frame (a CPU always gives the same bits)",
     "density": f"density control: {', '.join(DENSITIES)}",
     "max_gaussians": "start with no more than this, and grow no further, evenly towards it; 0: no limit",
     "random_points": "Gaussians at the start where SCENE has no points (default: 100000, or --max-gaussians where that "
@@ -91,7 +93,7 @@ def add_parser(subcommands) -> None:
     add("--test-every", type=int, metavar="N", help=test_every)
     cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
     add("--cameras", metavar="NAME", help=cameras)
-    lens = "photographs with lens distortion are resampled to pinholes, or an error (default: undistort)"
+    lens = "photographs with a lens are rendered with it, resampled to pinholes, or an error (default: exact)"
     add("--lens", choices=LENS_CHOICES, help=lens)
     missing = "pictures that are not there are an error, or left out with their cameras (default: refuse)"
     add("--missing", choices=MISSING_CHOICES, help=missing)

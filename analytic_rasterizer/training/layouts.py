@@ -1,8 +1,7 @@
 """The layouts of captures: what each of them says of its photographs.
 
 They are NeRF-synthetic scenes (transforms_train.json), the multi-scale Blender set (metadata.json), COLMAP
-reconstructions (folders of binary or text files) and nerfstudio captures (transforms.json). Cameras are pinholes, or
-have a lens of `lenses`.
+reconstructions (folders of binary or text files) and nerfstudio captures (transforms.json).
 """
 
 from __future__ import annotations
@@ -19,9 +18,8 @@ from torch import Tensor
 from .. import io
 from ..io import BLACK, WHITE, load_points
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
-from ..io.views import checked_pixels, checked_pose, checked_positive, distortion_of, read_views
+from ..io.views import checked_pixels, checked_pose, checked_positive, read_views
 from . import colmap
-from .lenses import RATIONAL, Lens, lens_of, window_of
 
 MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
 
@@ -30,14 +28,14 @@ class Photograph(NamedTuple):
     """A camera, and the files of its picture.
 
     Attributes:
-        view: The camera without the lens, and of the size of the whole picture.
+        view: The camera, of the size of the whole picture.
         files: By scale, where 2 is half the size. 1 is always there, and makes the scales that are not.
-        lens: What `load_pictures` removes from the picture; None for a pinhole.
+        undistort: Whether `load_pictures` resamples the picture to that of a pinhole.
     """
 
     view: io.View
     files: dict[int, Path]
-    lens: Lens | None = None
+    undistort: bool = False
 
 
 class Capture(NamedTuple):
@@ -84,7 +82,7 @@ def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capt
 def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> Capture:
     """The capture of a COLMAP reconstruction whose pictures are in a folder `images` of `folder`.
 
-    Raises io.SceneError for what `colmap.load_views` refuses, and for lenses that cannot be undistorted.
+    Raises io.SceneError for what `colmap.load_views` refuses.
     """
     if not colmap.is_reconstruction(sparse):
         raise io.SceneError(f"{sparse}: expected COLMAP's cameras and images (.bin or .txt)")
@@ -96,10 +94,7 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
         expected = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
         raise io.SceneError(f"{folder / images}: no such folder; {expected}")
     files = PictureFiles(folder / images)
-    items = []
-    for item in registered:
-        _check_lens(item.lens, item.view, f"{sparse}/cameras: {item.camera}")
-        items.append(Photograph(item.view, {1: files.find(item.name)}, item.lens))
+    items = [Photograph(item.view, {1: files.find(item.name)}) for item in registered]
     points = colmap.load_points(sparse)
     masks = _count_masks(folder, folder / images)
     return Capture(
@@ -111,46 +106,17 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
     )
 
 
-def _check_lens(lens: Lens | None, view: io.View, where: str) -> None:
-    """Raises io.SceneError, which begins with `where`, for a lens that cannot be undistorted."""
-    if lens is None:
-        return
-    try:
-        window_of(lens, view)
-    except io.SceneError as error:
-        raise io.SceneError(f"{where}: {error}; undistort the pictures first, with another model") from None
-
-
 def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
     """The views of a transforms file and where their pictures are, in the order of the file; and all that it says.
 
-    Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lenses that
-    cannot be undistorted.
+    Raises io.SceneError for what `io.load_views` refuses, and for lists of cameras, which it reads too.
     """
     views, data = read_views(path)
     if not isinstance(data, dict):
         raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
-    found = []
     files = PictureFiles(path.parent)
-    for i, (view, frame) in enumerate(zip(views, data["frames"])):
-        where = f"{path}: frame {i}"
-        lens = _lens_of_frame(data | frame, where)
-        _check_lens(lens, view, where)
-        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, lens))
-    return found, data
-
-
-def _lens_of_frame(entry: dict[str, Any], where: str) -> Lens | None:
-    """The lens of a frame of a transforms file, with what all frames share. Raises io.SceneError."""
-    said = distortion_of(entry)
-    model = entry.get("camera_model") or "OPENCV"
-    unknown = {"distortion_params", "is_fisheye"} | (set() if model == RATIONAL else {"k5", "k6"})
-    for name in unknown & said.keys():
-        raise io.SceneError(
-            f"{where}: lenses must be those of OpenCV (k1, k2, k3, k4, p1, p2), got {name} = {said[name]}; undistort "
-            "the pictures first"
-        )
-    return lens_of(model, said, where)
+    frames = zip(views, data["frames"])
+    return [Photograph(view, {1: files.find(str(frame.get("file_path", "")))}) for view, frame in frames], data
 
 
 def nerfstudio(path: Path, test_every: int) -> Capture:

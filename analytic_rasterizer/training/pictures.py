@@ -21,8 +21,8 @@ from .. import io
 from ..io.common import opened_picture
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
-from .lenses import without_lens
 from .options import check_scales
+from .undistortion import without_lens
 
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
 NAMED = 3  # files in a warning
@@ -78,8 +78,8 @@ def load_pictures(
 ) -> Pictures:
     """Reads photographs and reduces them.
 
-    A picture of a camera with a lens is resampled to that of a pinhole, see `lenses.without_lens`. All pictures are cut
-    about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
+    A picture that is to be undistorted is resampled to that of a pinhole, see `lenses.without_lens`. All pictures are
+    cut about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
 
     Args:
         items: What `load_capture` found.
@@ -178,9 +178,10 @@ def _tells_orientation(stored: Stored, view: io.View) -> bool:
 
 
 def fitted(rgba: Tensor, item: Photograph, multiple: int) -> tuple[io.View, Tensor]:
-    """The picture (H, W, 4) of a photograph without its lens, and its view, cut about the centre to multiples of px.
+    """The picture (H, W, 4) of a photograph and its view, cut about the centre to multiples of px.
 
-    The principal point moves along. Where the picture is not of the size that the view states, the view is scaled.
+    It is undistorted if that is wanted. The principal point moves along. Where the picture is not of the size that the
+    view states, the view is scaled.
 
     Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
@@ -195,9 +196,9 @@ def fitted(rgba: Tensor, item: Photograph, multiple: int) -> tuple[io.View, Tens
     cx = x * (view.width / 2 if view.cx is None else view.cx)
     cy = y * (view.height / 2 if view.cy is None else view.cy)
     view = replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=cx, cy=cy)
-    if item.lens is not None:
+    if item.undistort:
         try:
-            view, rgba = without_lens(rgba, view, item.lens)
+            view, rgba = without_lens(rgba, view)
         except io.SceneError as error:
             raise io.SceneError(f"{path}: {error}") from None
     left, top = view.width % multiple // 2, view.height % multiple // 2

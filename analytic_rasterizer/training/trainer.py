@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -45,11 +47,26 @@ class Shown(NamedTuple):
     background: Tensor | None  # (3,) that was drawn for it
 
 
+@contextmanager
+def deterministic_mode() -> Iterator[None]:
+    """torch's deterministic mode, in which CUDA frames count their pairs. One that is on already stays as it is.
+
+    Operators without a deterministic algorithm warn. Not by `use_deterministic_algorithms`, which imports the compiler.
+    """
+    before = torch.get_deterministic_debug_mode()
+    torch.set_deterministic_debug_mode(before or "warn")
+    try:
+        yield
+    finally:
+        torch.set_deterministic_debug_mode(before)
+
+
 class Trainer:
     """Trains Gaussians on pictures, step by step.
 
     On CUDA nothing in a step waits for the device, but one step in 100, and those that change the number of Gaussians.
-    The same seed gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
+    The same seed gives the same bits (on CUDA see `deterministic` of the options); so does a training that goes on from
+    `state_dict`, in another process as well.
 
     Args:
         options: Of the training.
@@ -126,6 +143,10 @@ class Trainer:
             FloatingPointError: At a look, every 100 steps: most Gaussians have left float32.
             RuntimeError: There is no Gaussian any more, or none that a picture shows.
         """
+        with deterministic_mode() if self.options.deterministic else nullcontext():
+            self._step()
+
+    def _step(self) -> None:
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
@@ -206,7 +227,6 @@ class Trainer:
         """The pictures of the next step."""
         count, settings = self.options.pictures_per_step, self._settings()
         first = self.progress.step * count
-        effects = None if self.filter_3d is None else Effects(filter_3d=self.filter_3d)
         shown = []
         for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
@@ -214,8 +234,8 @@ class Trainer:
             if self.random_background:
                 background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
-            if effects is not None:
-                chosen = chosen._replace(effects=effects)
+            if self.filter_3d is not None:
+                chosen = chosen._replace(effects=replace(chosen.effects or Effects(), filter_3d=self.filter_3d))
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
