@@ -141,7 +141,7 @@ def test_a_scene_that_is_too_large_for_webgpu_is_drawn_without(browser):
         wait_for_frame(page)
         expected = (
             "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics "
-            "of degree 3. Footprints of several samples need WebGPU."
+            "of degree 3. Footprints in grey need WebGPU."
         )
         assert page.text_content("#renderer") == expected
 

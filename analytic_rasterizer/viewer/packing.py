@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,12 @@ MAX_SH_DEGREE = 3
 GEOMETRY_WIDTH = 12
 """Numbers of a Gaussian in `PackedScene.geometry`."""
 LARGEST_HALF = 65504.0
+Z_IS_UP = 3.0
+"""How much more than y, in what faces it and in flatness together, the axis z must have to be up; see `upright`."""
+PICTURE = 0.95
+"""The part of a picture, by area, that faces its viewer."""
+DOWN = math.radians(15)
+"""How far a camera without views looks down: it stands above the floor."""
 DEFAULT_SIZE = (1280, 720)
 DEFAULT_FOCAL = 1100.0  # px: a vertical field of view of 36 degrees in a picture of the default size
 
@@ -156,7 +163,11 @@ def pack_scene(
     harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
 
     center, radius = extent(scene)
-    views = views or [overview(center, radius)]
+    if views:
+        up = mean_up(views)
+    else:
+        axis, ahead = upright(scene, center, radius)
+        views, up = [overview(center, radius, axis, ahead)], axis.tolist()
     meta = {
         "name": name,
         "count": count,
@@ -168,7 +179,7 @@ def pack_scene(
         "views": [_view_entry(view) for view in views],
         "center": center.tolist(),
         "radius": radius,
-        "up": mean_up(views),
+        "up": up,
     }
     return PackedScene(meta, geometry.numpy().astype("<f4").tobytes(), harmonics.numpy().astype("<f2").tobytes())
 
@@ -192,17 +203,57 @@ def extent(scene: Gaussians) -> tuple[torch.Tensor, float]:
     return center, max(distance.quantile(0.8).item(), 2 * largest, 1e-3)
 
 
-def overview(center: torch.Tensor, radius: float) -> io.View:
-    """A camera that looks along +z at the centre, with most of the scene in the picture."""
+def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """The directions, float64 (3,), that are probably up in a scene and away from a viewer who stands before it.
+
+    Two conventions are common: -y is up where photographs were taken (COLMAP), +z in models (Blender). Scenes in which
+    z is up are flat along z, and have their floors across it. What faces z everywhere is a picture: it hangs, and is
+    looked at from -z.
+    """
+    step = max(1, len(scene.means) // 100_000)
+    means, scales, opacities = scene.means[::step].double(), scene.scales[::step].double(), scene.opacities[::step]
+    w, x, y, z = _unit_quaternions(scene.rotations[::step]).double().unbind(1)
+    # Rows y and z of the rotations: column k is what axis k of a Gaussian has of that direction.
+    of_y = torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
+    of_z = torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    thinnest = scales.argmin(dim=1, keepdim=True)
+    small, middle, large = scales.sort(dim=1).values.unbind(1)
+    near = (means - center).norm(dim=1) < 1.5 * radius
+    axes = torch.eye(3, dtype=torch.float64, device="cpu")
+    if not near.any():
+        return -axes[1], axes[2]
+    area = near * opacities[:, 0].double() * middle * large * (1 - small / middle.clamp_min(1e-30))
+    facing_y, facing_z = ((area * rows.gather(1, thinnest)[:, 0] ** 2).sum() for rows in (of_y, of_z))
+    spread_y, spread_z = (
+        (means[near, k].quantile(0.9) - means[near, k].quantile(0.1)).clamp_min(1e-6 * radius) for k in (1, 2)
+    )
+    is_picture = facing_z > PICTURE * area.sum()
+    if not is_picture and facing_z * spread_y > Z_IS_UP * facing_y * spread_z:
+        return axes[2], axes[1]
+    return -axes[1], axes[2]
+
+
+def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch.Tensor) -> io.View:
+    """A camera that looks at the centre with most of the scene in the picture: along `ahead` and somewhat down.
+
+    Args:
+        center, up, ahead: (3,), the last two of length 1 and orthogonal.
+        radius: World units.
+    """
     width, height = DEFAULT_SIZE
+    forward = math.cos(DOWN) * ahead - math.sin(DOWN) * up
+    down = -math.sin(DOWN) * ahead - math.cos(DOWN) * up
     w2c = torch.eye(4, dtype=torch.float64, device="cpu")
-    w2c[:3, 3] = -center
+    w2c[:3, :3] = torch.stack([torch.linalg.cross(down, forward), down, forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ center
     w2c[2, 3] += 2 * radius * DEFAULT_FOCAL / height + 0.2
     return io.View("overview", width, height, DEFAULT_FOCAL, DEFAULT_FOCAL, w2c)
 
 
 def _view_entry(view: io.View) -> dict:
     entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
+    if view.lens is not None:
+        entry["name"] += " (without its lens)"  # the page has pinholes
     entry["cx"] = view.width / 2 if view.cx is None else view.cx
     entry["cy"] = view.height / 2 if view.cy is None else view.cy
     return entry | {"w2c": view.w2c.flatten().tolist()}

@@ -12,6 +12,10 @@ const RADIANS_PER_PX = 0.006;
 const SMALL_TOUCH_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px)';
 export const READING_TIME = 4;  // seconds that a message stays
 
+/// Colours of fields, '#rrggbb', and back.
+export const hexOf = rgb => `#${rgb.map(value => Math.round(255 * value).toString(16).padStart(2, '0')).join('')}`;
+export const rgbOf = hex => [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16) / 255);
+
 /// Shows one sentence in place of the picture.
 export function showFailure(sentence) {
   const paragraph = document.createElement('p');
@@ -73,7 +77,7 @@ export class Interface {
     element('compare').replaceChildren(new Option('nothing', ''), ...options());
     const lacks = all.some(footprint => !renderer.draws(footprint));
     element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
-      `${lacks ? ' Footprints of several samples need WebGPU.' : ''}` +
+      `${lacks ? ' Footprints in grey need WebGPU.' : ''}` +
       `${renderer.bits === 8 ? ' It has 8 bits per channel: colours are off by up to 6 of 255 levels.' : ''}`;
   }
 
@@ -86,6 +90,7 @@ export class Interface {
       input.addEventListener('change', () => viewer.change({ mode: input.value }));
     }
     element('resolution').addEventListener('input', event => viewer.change({ divisor: DIVISORS[event.target.value] }));
+    element('background').addEventListener('input', event => viewer.change({ background: rgbOf(event.target.value) }));
     element('view').addEventListener('change', event => viewer.goToView(Number(event.target.value)));
     element('previous').addEventListener('click', () => viewer.stepView(-1));
     element('next').addEventListener('click', () => viewer.stepView(1));
@@ -246,6 +251,7 @@ export class Interface {
     const resolution = divisor === 1 ? '1' : `1/${divisor}`;
     element('resolution-text').textContent = resolution;
     element('resolution').setAttribute('aria-valuetext', resolution);
+    element('background').value = hexOf(this.viewer.state.background);
     element('view').value = this.viewer.camera.view;
     const place = `${100 * divider}%`;
     for (const id of ['divider', 'label-left', 'label-right']) {

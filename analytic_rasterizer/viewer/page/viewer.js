@@ -2,7 +2,7 @@
 
 import { Camera, add, between, depthAt, times } from './camera.js';
 import { parseFootprint } from './constants.js';
-import { Interface, READING_TIME, announce, showFailure } from './interface.js';
+import { Interface, READING_TIME, announce, hexOf, rgbOf, showFailure } from './interface.js';
 import { Pace } from './pace.js';
 import { openRenderer } from './renderers.js';
 
@@ -347,6 +347,3 @@ export class Viewer {
     return renderer.isLost;
   }
 }
-
-const hexOf = rgb => `#${rgb.map(value => Math.round(255 * value).toString(16).padStart(2, '0')).join('')}`;
-const rgbOf = hex => [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16) / 255);
