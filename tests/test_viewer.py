@@ -106,12 +106,12 @@ def test_without_views_there_is_one_that_sees_the_scene():
 
 
 def floor(across, thickness, count=400):
-    """Flat Gaussians across axis number `across`, and above them on a third of its area some of all directions."""
+    """Flat Gaussians that face along axis number `across`, and as many that face anywhere, in a flat box."""
     g = torch.Generator().manual_seed(1)
     means = torch.rand(2 * count, 3, generator=g) - 0.5
     means[:, across] *= thickness
     scales = torch.full((2 * count, 3), 0.02)
-    scales[:count, across] = 1e-4
+    scales[:, across] = 1e-4
     rotations = torch.randn(2 * count, 4, generator=g)
     rotations[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     return Gaussians.from_activated(
@@ -122,29 +122,28 @@ def floor(across, thickness, count=400):
 def picture():
     """Flat Gaussians that all face z, in layers, as the demonstration's."""
     scene = floor(2, 0.5)
-    return scene._replace(log_scales=scene.log_scales[:400].repeat(2, 1), rotations=scene.rotations[:400].repeat(2, 1))
+    return scene._replace(rotations=scene.rotations[:400].repeat(2, 1))
 
 
 @pytest.mark.parametrize(
-    "make, up, ahead",
+    "make, up, ahead, above",
     [
-        (lambda: floor(1, 0.4), [0, -1, 0], [0, 0, 1]),
-        (lambda: floor(1, 1.0), [0, -1, 0], [0, 0, 1]),
-        (lambda: floor(2, 0.4), [0, 0, 1], [0, 1, 0]),
-        (lambda: floor(0, 0.4), [0, -1, 0], [0, 0, 1]),
-        (picture, [0, -1, 0], [0, 0, 1]),
-        (lambda: make_scene(1), [0, -1, 0], [0, 0, 1]),
+        (lambda: floor(1, 0.4), [0, -1, 0], [0, 0, 1], 0.2),
+        (lambda: floor(1, 1.0), [0, -1, 0], [0, 0, 1], 0.2),
+        (lambda: floor(2, 0.4), [0, 0, 1], [0, 1, 0], 0.2),
+        (lambda: floor(0, 0.4), [0, -1, 0], [0, 0, 1], 0.2),
+        (picture, [0, -1, 0], [0, 0, 1], -1e-6),  # it hangs, and is looked at head on
     ],
 )
-def test_the_first_view_stands_upright_before_the_scene_and_above_its_floor(make, up, ahead):
+def test_the_first_view_stands_upright_before_the_scene_and_above_its_floor(make, up, ahead, above):
     meta = viewer.pack_scene(make()).meta
     w2c = torch.tensor(meta["views"][0]["w2c"]).reshape(4, 4)
     up, ahead = torch.tensor(up).double(), torch.tensor(ahead).double()
     right, down, forward = w2c[:3, :3].double()
     torch.testing.assert_close(torch.linalg.cross(down, forward), right)  # a rotation
-    assert down @ up < -0.9 and forward @ ahead > 0.9 and right @ up == 0
+    assert down @ up < -0.9 and forward @ ahead > 0.9 and abs(right @ up) < 1e-6
     eye = -w2c[:3, :3].double().T @ w2c[:3, 3].double() - torch.tensor(meta["center"])
-    assert eye @ up > 0.2 * eye.norm()
+    assert above * eye.norm() < eye @ up < 0.4 * eye.norm()
     assert meta["up"] == up.tolist()
 
 

@@ -60,6 +60,8 @@ PICTURE = 0.95
 """The part of a picture, by area, that faces its viewer."""
 DOWN = math.radians(15)
 """How far a camera without views looks down: it stands above the floor."""
+MARGIN = 1.3
+"""How much larger than the scene's radius the picture of such a camera is."""
 DEFAULT_SIZE = (1280, 720)
 DEFAULT_FOCAL = 1100.0  # px: a vertical field of view of 36 degrees in a picture of the default size
 
@@ -166,8 +168,8 @@ def pack_scene(
     if views:
         up = mean_up(views)
     else:
-        axis, ahead = upright(scene, center, radius)
-        views, up = [overview(center, radius, axis, ahead)], axis.tolist()
+        axis, ahead, down = upright(scene, center, radius)
+        views, up = [overview(center, radius, axis, ahead, down)], axis.tolist()
     meta = {
         "name": name,
         "count": count,
@@ -203,8 +205,9 @@ def extent(scene: Gaussians) -> tuple[torch.Tensor, float]:
     return center, max(distance.quantile(0.8).item(), 2 * largest, 1e-3)
 
 
-def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """The directions, float64 (3,), that are probably up in a scene and away from a viewer who stands before it.
+def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """The directions, float64 (3,), that are probably up in a scene and away from a viewer who stands before it, and
+    the angle by which this viewer looks down, from above the floor.
 
     Two conventions are common: -y is up where photographs were taken (COLMAP), +z in models (Blender). Scenes in which
     z is up are flat along z, and have their floors across it. What faces z everywhere is a picture: it hangs, and is
@@ -221,7 +224,7 @@ def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torc
     near = (means - center).norm(dim=1) < 1.5 * radius
     axes = torch.eye(3, dtype=torch.float64, device="cpu")
     if not near.any():
-        return -axes[1], axes[2]
+        return -axes[1], axes[2], 0.0
     area = near * opacities[:, 0].double() * middle * large * (1 - small / middle.clamp_min(1e-30))
     facing_y, facing_z = ((area * rows.gather(1, thinnest)[:, 0] ** 2).sum() for rows in (of_y, of_z))
     spread_y, spread_z = (
@@ -229,24 +232,25 @@ def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torc
     )
     is_picture = facing_z > PICTURE * area.sum()
     if not is_picture and facing_z * spread_y > Z_IS_UP * facing_y * spread_z:
-        return axes[2], axes[1]
-    return -axes[1], axes[2]
+        return axes[2], axes[1], DOWN
+    return -axes[1], axes[2], 0.0 if is_picture else DOWN
 
 
-def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch.Tensor) -> io.View:
-    """A camera that looks at the centre with most of the scene in the picture: along `ahead` and somewhat down.
+def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch.Tensor, angle: float) -> io.View:
+    """A camera that looks at the centre with most of the scene in the picture: along `ahead`, and down by an angle.
 
     Args:
         center, up, ahead: (3,), the last two of length 1 and orthogonal.
         radius: World units.
+        angle: Radians.
     """
     width, height = DEFAULT_SIZE
-    forward = math.cos(DOWN) * ahead - math.sin(DOWN) * up
-    down = -math.sin(DOWN) * ahead - math.cos(DOWN) * up
+    forward = math.cos(angle) * ahead - math.sin(angle) * up
+    down = -math.sin(angle) * ahead - math.cos(angle) * up
     w2c = torch.eye(4, dtype=torch.float64, device="cpu")
     w2c[:3, :3] = torch.stack([torch.linalg.cross(down, forward), down, forward])
     w2c[:3, 3] = -w2c[:3, :3] @ center
-    w2c[2, 3] += 2 * radius * DEFAULT_FOCAL / height + 0.2
+    w2c[2, 3] += MARGIN * 2 * radius * DEFAULT_FOCAL / height + 0.2
     return io.View("overview", width, height, DEFAULT_FOCAL, DEFAULT_FOCAL, w2c)
 
 
