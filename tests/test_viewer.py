@@ -389,6 +389,15 @@ def test_the_command_shows_what_is_near_to_what_the_page_cannot_draw(files, caps
     assert capsys.readouterr().err == f"{expected}; --server shows it\n"
 
 
+def test_the_background_is_that_of_the_file(files):
+    path, out = files / "paper.ply", files / "out.html"
+    io.save_scene(path, make_scene(), io.SceneMetadata(footprint="moment", background=(1, 0.5, 0.25)))
+    assert run_view(path, "--export", out) == 0
+    assert '"background": [1.0, 0.5, 0.25]' in out.read_text(encoding="utf-8")
+    assert run_view(path, "--export", out, "--background", "white") == 0
+    assert '"background": [1.0, 1.0, 1.0]' in out.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
@@ -501,6 +510,18 @@ def test_shaders_have_no_numbers_of_their_own():
             assert found <= {"0.4366", "0.6240", "0.6975"}, (name, found)
 
 
+def run_node(folder, modules, script):
+    """What a script that imports these modules of the page prints, as JSON."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    for name in modules:
+        (folder / name).write_text(pages.page_file(name))
+    (folder / "package.json").write_text('{"type": "module"}')
+    (folder / "script.js").write_text(script)
+    done = subprocess.run(["node", "script.js"], cwd=folder, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
 PARSE = """
 import { readFileSync } from 'fs';
 import { parseFootprint } from './constants.js';
@@ -512,17 +533,11 @@ console.log(JSON.stringify(names.map(parsed)));
 
 def test_the_page_finds_footprints_by_name(tmp_path):
     """As the library does, among those that it is handed."""
-    if shutil.which("node") is None:
-        pytest.skip("needs node")
     known = viewer.pack_scene(make_scene()).meta["footprints"]
     right = [*viewer.PAGE_FOOTPRINTS, "box", "point:dilation=0.5", "mip:variance=0"]
     wrong = ["box:samples=8", "mip:dilation=1", "mip:variance=-1", "mip:variance=", "analytic:=1", "exact", "", "x:y=1"]
-    (tmp_path / "constants.js").write_text(pages.page_file("constants.js"))
-    (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "names.json").write_text(json.dumps({"known": known, "names": right + wrong}))
-    (tmp_path / "parse.js").write_text(PARSE)
-    done = subprocess.run(["node", "parse.js"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    parsed = json.loads(done.stdout)
+    parsed = run_node(tmp_path, ["constants.js"], PARSE)
     for name, found in zip(right, parsed):
         footprint = ar.resolve_footprint(name)
         assert viewer.page_footprint(footprint).split("=")[0] == found["name"].split("=")[0]
@@ -530,6 +545,46 @@ def test_the_page_finds_footprints_by_name(tmp_path):
         if found["option"] is not None:
             assert found["variance"] == footprint.option
     assert parsed[len(right) :] == [f"There is no footprint '{name}'." for name in wrong]
+
+
+PACE = """
+import { Pace } from './pace.js';
+const follow = (milliseconds, frames) => {
+  const pace = new Pace(), divisors = [];
+  for (let k = 0; k < frames; ++k) {
+    pace.note(milliseconds(pace.divisor, k));
+    divisors.push(pace.divisor);
+  }
+  return divisors;
+};
+console.log(JSON.stringify({
+  quick: follow(() => 5, 6),
+  slow: follow(divisor => 10 + 200 / (divisor * divisor), 8),  // 60 ms at 1/2, 22 ms at 1/4
+  stubborn: follow(() => 90, 8),                               // nothing is gained
+  recovers: follow((divisor, k) => (k < 3 ? 100 / divisor : 4), 12),
+}));
+"""
+
+
+def test_pictures_in_motion_are_as_small_as_they_must_be(tmp_path):
+    followed = run_node(tmp_path, ["pace.js"], PACE)
+    assert followed["quick"] == [1] * 6
+    assert followed["slow"][-4:] == [4] * 4
+    assert followed["stubborn"][-4:] == [1] * 4
+    assert 2 in followed["recovers"] and followed["recovers"][-1] == 1
+
+
+CELLS = """
+import { cellsOf } from './constants.js';
+console.log(JSON.stringify([1, 4, 16].map(cellsOf)));
+"""
+
+
+def test_cells_tile_the_pixel_in_the_order_of_the_header(tmp_path):
+    """node() of moment.h: rows of cells, from half cells (2 k + 1 - side) / (2 side)."""
+    for side, cells in zip((1, 2, 4), run_node(tmp_path, ["constants.js"], CELLS)):
+        centres = [(2 * k + 1) / (2 * side) - 0.5 for k in range(side)]
+        assert cells == [[x, y] for y in centres for x in centres]
 
 
 def kinds_in(module, table):

@@ -533,6 +533,23 @@ def test_two_fingers_zoom(browser):
         np.testing.assert_allclose(near[7] + near[2], 2 * near[7], rtol=1e-5)
 
 
+def test_the_wheel_never_loses_the_scene(controls):
+    near = changed_pose(controls, lambda: [controls.mouse.wheel(0, -1000) for _ in range(15)])
+    assert near[7] == pytest.approx(0.3)  # beyond the near plane
+    far = changed_pose(controls, lambda: [controls.mouse.wheel(0, 1000) for _ in range(15)])
+    radius = viewer.pack_scene(random_scene(500)).meta["radius"]
+    assert far[7] == pytest.approx(30 * radius, rel=1e-5)
+
+
+def test_the_background_can_be_chosen(controls):
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+    controls.fill("#background", "#3060c0")
+    wait_for(controls, "() => location.hash.includes('background=3060c0')")
+    controls.keyboard.press("h")
+    shown = np.asarray(image.open(BytesIO(settle(controls))).convert("RGB"))
+    assert (shown == [0x30, 0x60, 0xC0]).all(axis=2).any()
+
+
 def test_the_address_brings_back_pose_and_state(browser):
     with serve(random_scene(200), [facing()]) as server:
         state = "#view=0&camera=0.1,0.2,-0.3,0.9950042,0,0.0998334,0,4&footprint=mip&compare=point&mode=split&reduce=2"
