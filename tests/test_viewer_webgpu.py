@@ -169,8 +169,18 @@ def test_a_lost_device_comes_back_once_and_then_webgl_draws(browser):
         assert page.evaluate("() => devices.length") == 2
         page.evaluate(lose)
         wait_for(page, "() => document.getElementById('renderer').textContent.startsWith('WebGL 2 draws: ')")
-        assert "the graphics device was lost twice." in page.text_content("#renderer")
+        assert "WebGPU lost the graphics device twice." in page.text_content("#renderer")
         assert_same(drawn(page, "analytic", view.width, view.height), rendered(scene, view, "analytic"))
+        assert page.is_hidden("#message")
+
+
+def test_where_webgpu_fails_webgl_draws(browser):
+    init = """
+      GPUDevice.prototype.createComputePipelineAsync = async () => { throw new Error('A shader is refused.'); };"""
+    with serve(random_scene(100), [facing()]) as server, open_gpu(browser, server, init=init) as page:
+        wait_for_frame(page)
+        expected = "WebGL 2 draws: WebGPU failed here. A shader is refused. Footprints in grey need WebGPU."
+        assert page.text_content("#renderer") == expected
         assert page.is_hidden("#message")
 
 

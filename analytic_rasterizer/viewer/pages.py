@@ -25,6 +25,7 @@ MODULES = (
     "renderers.js",
     "camera.js",
     "interface.js",
+    "address.js",
     "pace.js",
     "viewer.js",
     "main.js",

@@ -1,10 +1,12 @@
 // The viewer: its state, and the loop that draws when something has changed.
 
+import { readAddress, writeAddress } from './address.js';
 import { Camera, add, between, depthAt, times } from './camera.js';
 import { parseFootprint } from './constants.js';
-import { Interface, READING_TIME, announce, hexOf, rgbOf, showFailure } from './interface.js';
+import { Interface, READING_TIME, announce, showFailure } from './interface.js';
 import { Pace } from './pace.js';
 import { openRenderer } from './renderers.js';
+import { WebGLRenderer } from './webgl.js';
 
 const REST_AFTER = 200;         // ms without motion
 const TRAVEL_TIME = 450;        // ms of the way to another pose
@@ -41,19 +43,35 @@ export class Viewer {
   async load(scene) {
     const { renderer } = this;
     this.scene = scene;
-    await renderer.load(scene);
-    renderer.lost.then(() => { if (this.renderer === renderer) this.recovery = this.recover(); });
+    try {
+      await renderer.load(scene);
+    } catch (error) {
+      await this.replace(renderer, error);
+      return;
+    }
+    renderer.lost.then(() => this.replace(renderer)).catch(() => {});  // which has said why
   }
 
-  /// Another renderer after the device was lost: the same once, then WebGL 2.
-  async recover() {
+  /// Another renderer in place of one whose device was lost: the same once, then WebGL 2; or of WebGPU that failed.
+  async replace(renderer, failure = null) {
+    if (failure && renderer instanceof WebGLRenderer) throw failure;
+    if (this.renderer === renderer && this.replaced !== renderer) {
+      this.replaced = renderer;
+      this.recovery = this.recover(renderer, failure);
+    }
+    await this.recovery;
+  }
+
+  async recover(renderer, failure) {
     announce('The graphics device was taken away; waiting for it to come back.');
-    await this.renderer.returned;
-    this.renderer.dispose();
-    if (++this.losses > 1) this.wish = 'webgl';
+    if (!failure) await renderer.returned;
+    renderer.dispose();
+    if (!(renderer instanceof WebGLRenderer)) this.losses += 1;
+    if (failure || this.losses > 1) this.wish = 'webgl';
     try {
       await this.open();
-      if (this.losses > 1 && this.reason !== '') this.reason = 'the graphics device was lost twice.';
+      if (failure) this.reason = `WebGPU failed here. ${failure.message}`;
+      else if (this.losses > 1) this.reason = 'WebGPU lost the graphics device twice.';
       await this.load(this.scene);
     } catch (error) {
       showFailure(error.message);
@@ -67,11 +85,11 @@ export class Viewer {
 
   /// Starts to draw for the user.
   interact() {
-    this.readAddress();
+    readAddress(this);
     this.controls = new Interface(this);
     new ResizeObserver(() => this.wake()).observe(this.surface);
     window.addEventListener('hashchange', () => {
-      this.readAddress();
+      readAddress(this);
       this.controls.update();
       this.wake();
     });
@@ -166,45 +184,6 @@ export class Viewer {
     return moving || !this.renderer.draws(wanted) ? this.footprint(wanted.instead ?? wanted.name) : wanted;
   }
 
-  // ------------------------------------------------------------------ the address
-
-  /// Takes pose, footprints and resolution from the address, where it has them.
-  readAddress() {
-    const given = new URLSearchParams(location.hash.slice(1)), { state } = this;
-    const valid = name => {
-      try {
-        return name !== null && this.footprint(name) !== null;
-      } catch {
-        return false;
-      }
-    };
-    const view = Number(given.get('view') ?? -1);
-    if (Number.isInteger(view) && view >= 0 && view < this.meta.views.length && given.has('view')) {
-      this.camera.setView(view);
-      this.atView = true;
-    }
-    if (valid(given.get('footprint'))) state.footprint = given.get('footprint');
-    state.compare = valid(given.get('compare')) ? given.get('compare') : null;
-    if (['split', 'difference'].includes(given.get('mode'))) state.mode = given.get('mode');
-    if (['1', '2', '4', '8'].includes(given.get('reduce'))) state.divisor = Number(given.get('reduce'));
-    if (/^[0-9a-f]{6}$/.test(given.get('background') ?? '')) state.background = rgbOf(`#${given.get('background')}`);
-    const pose = Camera.poseFromText(given.get('camera') ?? '');
-    if (pose !== null) {
-      this.camera.pose = pose;
-      this.atView = false;
-    }
-  }
-
-  writeAddress() {
-    const { footprint, compare, mode, divisor, background } = this.state, parts = [`view=${this.camera.view}`];
-    if (!this.atView) parts.push(`camera=${this.camera.poseText()}`);
-    parts.push(`footprint=${footprint}`);
-    if (compare !== null) parts.push(`compare=${compare}`, `mode=${mode}`);
-    if (divisor !== 1) parts.push(`reduce=${divisor}`);
-    if (background !== this.meta.background) parts.push(`background=${hexOf(background).slice(1)}`);
-    history.replaceState(null, '', `${location.pathname}${location.search}#${parts.join('&')}`);
-  }
-
   // ------------------------------------------------------------------ the loop
 
   /// Has a frame drawn soon.
@@ -229,7 +208,7 @@ export class Viewer {
     clearTimeout(this.restTimer);
     this.restTimer = setTimeout(() => {
       this.rate = null;
-      this.writeAddress();
+      writeAddress(this);
       this.wake();
     }, REST_AFTER + 20);  // timers may be early
   }
@@ -264,8 +243,8 @@ export class Viewer {
     try {
       done = await this.drawFrame();
     } catch (error) {
-      if (!await this.wasLost(renderer)) showFailure(error.message);
-      return;  // a new device wakes the loop
+      if (!await this.wasLost(renderer)) this.replace(renderer, error).catch(() => showFailure(error.message));
+      return;  // another renderer wakes the loop
     } finally {
       this.drawing = false;
     }
