@@ -3,10 +3,9 @@
     pip install moderngl
     python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
 
-The sources of the shaders, their constants and the table of `analytic` are taken from the modules of the page, which
-node runs; what is around them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and
-blending. Footprints are those of one sample, which WebGL 2 draws.
-Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it comes from EGL and needs no window.
+The sources of the shaders and their constants are taken from the modules of the page, which node runs; what is around
+them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and blending. Footprints are those
+of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it comes from EGL and needs no window.
 
 Each picture of the first size, blended in 32-bit floats (as when the camera rests) and in half floats (as when it
 moves), is compared with that of the CPU rasterizer. Frames are then timed in half floats, footprints in turn, round
@@ -37,11 +36,10 @@ from pathlib import Path
 
 import numpy as np
 
-MODULES = ("constants.js", "sh.js", "logistic.js", "webgl_shaders.js")
+MODULES = ("constants.js", "sh.js", "webgl_shaders.js")
 EXTRACT = """
 import { readFileSync } from 'fs';
 import { CONSTANTS } from './constants.js';
-import { windowTable } from './logistic.js';
 import {
   FULL_SCREEN, GL_KINDS, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
   texelsOfHarmonics,
@@ -57,7 +55,7 @@ for (const { name, kind, samples, variance } of JSON.parse(readFileSync('footpri
 console.log(JSON.stringify({
   near: CONSTANTS.kNear, frustum_clamp: CONSTANTS.kFrustumClamp, splats_per_row: SPLATS_PER_ROW,
   splats_per_instance: SPLATS_PER_INSTANCE, texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
-  window: Array.from(windowTable()), full_screen: FULL_SCREEN, projections, footprints,
+  full_screen: FULL_SCREEN, projections, footprints,
 }));
 """
 HALF, FULL = "f2", "f4"  # what is blended, as moderngl calls it
@@ -267,7 +265,6 @@ class Renderer:
         self.harmonics_per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
         self.geometry = self.filled(3 * width, 4, "f4", job.geometry)
         self.harmonics = self.filled(texels * self.harmonics_per_row, 4, "f2", job.harmonics)
-        self.window = self.filled(2, 4, "f4", np.array(self.shaders["window"], np.float32))
         self.order = self.texture(width, self.rows, 1, "u4")
         self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
         self.splats_target = context.framebuffer(self.splats)
@@ -360,7 +357,7 @@ class Renderer:
         context.enable(context.BLEND)
         context.blend_func = context.ONE, context.ONE_MINUS_SRC_ALPHA
         names = ("uMean", "uWhitening", "uColor")
-        textures = dict(zip(names, self.splats)) | {"uOrder": self.order, "uWindow": self.window}
+        textures = dict(zip(names, self.splats)) | {"uOrder": self.order}
         self.set_uniforms(program, textures, uVisible=self.visible, uSize=(camera.width, camera.height))
         instances = -(-self.visible // self.shaders["splats_per_instance"])
         if instances > 0:

@@ -117,50 +117,6 @@ def test_hard_scenes(browser, case):
             assert_same(drawn(page, footprint, view.width, view.height), rendered(scene, view, footprint))
 
 
-def lone_splats(smallest, size=64, columns=16, rows=8):
-    """Opaque white splats that do not meet, of all shapes from `smallest` to 7 px, in cells of `size` pixels.
-
-    Powers of two and offsets of 1/64 px, so that no rounding moves a splat.
-    """
-    g, count, focal = torch.Generator().manual_seed(0), columns * rows, 1024.0
-    cells = torch.stack([torch.arange(count) % columns, torch.arange(count) // columns], 1)
-    offsets = (cells + 0.5) * size + torch.randint(64, (count, 2), generator=g) / 64
-    offsets = offsets - torch.tensor([columns, rows]) * size / 2
-    scales = smallest * (7 / smallest) ** torch.rand(count, 3, generator=g)
-    scales[:, 2] = 1e-3  # along the optical axis, at whose end the camera is so far away that 1 px is 1
-    angle = torch.pi * torch.rand(count, generator=g)
-    zero = torch.zeros(count)
-    scene = Gaussians.from_activated(
-        torch.cat([offsets, torch.full((count, 1), focal)], 1),
-        scales,
-        torch.stack([(angle / 2).cos(), zero, zero, (angle / 2).sin()], 1),
-        torch.ones(count, 1),
-        torch.full((count, 1, 3), 0.5 / 0.28209479177387814),
-    )
-    return scene, io.View("lone", columns * size, rows * size, focal, focal, torch.eye(4, dtype=torch.float64))
-
-
-# Alpha is the product of sqrt(2 pi) sigma F of both axes, each at most 1.003. Evaluated on fine grids of h and t, the
-# polynomials of logistic.js change it by up to 1.94e-4, at a sigma of 0.14 px, where it is 0.35 at most, and by up to
-# 2.3e-5 from a sigma of half a pixel on. So both together change alpha by up to 2.1e-4, or 4.6e-5 where both are half a
-# pixel or more, and by up to 0.25% of itself.
-@pytest.mark.gate
-@pytest.mark.parametrize("smallest, largest_error", [(0.04, 2.5e-4), (0.5, 6e-5)])
-def test_the_window_of_analytic_keeps_its_bounds(browser, smallest, largest_error):
-    scene, view = lone_splats(smallest)
-    expected = rendered(scene, view, "analytic")
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&footprint=analytic") as page:
-        wait_until_ready(page)
-        ours = pixels(page, view.width, view.height)
-    both = (ours > 0) & (expected > 0)
-    assert both.sum() > 10000
-    error = np.abs(ours - expected)
-    assert error[both].max() <= largest_error
-    assert (error[both] / expected[both]).max() <= 3e-3
-    # Where only one of them draws, alpha is at the threshold.
-    assert (ours + expected)[~both].max() <= (1 + 3e-3) / 255
-
-
 def test_several_views(browser):
     scene, views = random_scene(500), [facing(), turned_view()]
     with serve(scene, views) as server, open_page(browser, f"{server.url}?view=1&footprint=mip") as page:

@@ -16,7 +16,6 @@ MODULES = (
     "present.wgsl.js",
     "webgpu_passes.js",
     "webgpu.js",
-    "logistic.js",
     "load.js",
     "webgl_tools.js",
     "webgl_shaders.js",

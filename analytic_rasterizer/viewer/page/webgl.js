@@ -3,12 +3,11 @@
 
 import { CONSTANTS } from './constants.js';
 import { startSorter } from './load.js';
-import { LAST_HALF, ROWS_PER_UNIT, windowTable } from './logistic.js';
 import { Projection } from './webgl_project.js';
 import {
   FULL_SCREEN, GL_KINDS, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
 } from './webgl_shaders.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
+import { bindTextures, createFramebuffer, createProgram, createTexture } from './webgl_tools.js';
 
 // Above so many Gaussians the order is rough while the camera moves.
 const ROUGH_ORDER_FROM = 200000;
@@ -76,8 +75,6 @@ export class WebGLRenderer {
     this.settledFormat = this.bits === 8 ? bytes : floats && bits !== 16 ? full : half;
     this.programs = new Map();
     this.pictures = new Map();
-    this.window = createTexture(gl, 2, LAST_HALF * ROWS_PER_UNIT + 1, full);
-    fillTexture(gl, this.window, 2, full, 4, windowTable());
     this.fullScreen = gl.createVertexArray();
     this.quads = this.createQuads();
   }
@@ -162,7 +159,7 @@ export class WebGLRenderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     const [uMean, uWhitening, uColor] = projection.splats;
-    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: projection.order, uWindow: this.window });
+    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: projection.order });
     gl.uniform1i(uniforms.uVisible, projection.visible);
     gl.uniform2f(uniforms.uSize, width, height);
     gl.bindVertexArray(this.quads);

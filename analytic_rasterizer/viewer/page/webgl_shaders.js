@@ -1,12 +1,10 @@
-// GLSL of the passes: project, draw, present. The formulas are those of csrc/core, in the same form; only the
-// window of `analytic` is drawn by polynomials that are fitted to its formula (logistic.js).
+// GLSL of the passes: project, draw, present. The formulas are those of csrc/core, in the same form.
 //
 // Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
 // wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
 // GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
 
 import { CONSTANTS, MINIMAX } from './constants.js';
-import { FLAT_FROM, LAST_HALF, ROWS_PER_UNIT } from './logistic.js';
 import { addHarmonics, harmonicNumbers } from './sh.js';
 
 // Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
@@ -26,39 +24,19 @@ precision highp usampler2D;
 ${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glslNumber(value)};`).join('\n')}
 `;
 
-// What `analytic` computes once per splat: F(0) of docs/internals/numerics.md, "Logistic window". `r` = 1/sigma [1/px].
-const WINDOW_TOP = `
+// F(t) of docs/internals/numerics.md, "Logistic window", as numerator and denominator. `r` = 1/sigma [1/px].
+const WINDOW = `
+float logistic2(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }
 float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
   float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
   return x < 0.5 ? x * series : 1.0 - e;
 }
-float windowTop(float r) {
-  float h = 0.5 * r, f = h * (kLogistic1 + kLogistic3 * h * h), e = exp2(-f * kLog2e);
-  return oneMinusExp(f, e) / (1.0 + e);
-}
-`;
-
-// The rest of F by the polynomial of logistic.js: coefficients for each vertex, V for each pixel. `axis` is a row of
-// the whitening matrix [1/px], which is turned into units of w.
-const WINDOW_COEFFICIENTS = `
-uniform sampler2D uWindow;
-void readWindow(inout vec2 axis, out float flatTop, out vec4 c) {
-  float h = 0.5 * length(axis), place = min(h, ${glslNumber(LAST_HALF)}) * ${glslNumber(ROWS_PER_UNIT)};
-  int k = min(int(place), ${LAST_HALF * ROWS_PER_UNIT - 1});
-  float part = place - float(k);
-  vec4 first = mix(texelFetch(uWindow, ivec2(0, k), 0), texelFetch(uWindow, ivec2(0, k + 1), 0), part);
-  float last = mix(texelFetch(uWindow, ivec2(1, k), 0).x, texelFetch(uWindow, ivec2(1, k + 1), 0).x, part);
-  axis *= first.x;
-  flatTop = first.x * max(h - ${glslNumber(FLAT_FROM)}, 0.0);
-  c = vec4(first.yzw, last);
-}
-`;
-// By pairs of powers: one operation more than Horner's rule, but a chain of five that wait for one another instead of
-// nine. Software renderers draw this form faster (docs/internals/viewer.md).
-const WINDOW_POLYNOMIAL = `
-float windowV(float s, vec4 c) {
-  float square = s * s;
-  return (1.0 + s * c.x) + square * ((c.y + s * c.z) + square * (c.w + s));
+vec2 window(float t, float r) {
+  float h = 0.5 * r, distance = abs(t);
+  float lower = exp2(min(logistic2(distance - h), 40.0 * kLog2e));
+  float upper = exp2(max(-logistic2(distance + h), -126.0));  // what is smaller is no normal number
+  float y = 3.0 * kLogistic3 * r * t * t + r * (kLogistic1 + kLogistic3 * h * h);
+  return vec2(oneMinusExp(y, lower * upper), (1.0 + lower) * (1.0 + upper));
 }
 `;
 
@@ -110,9 +88,10 @@ export function projectShader(kind, degree) {
   }
   vec2 inverse = 1.0 / vec2(s1, s2);
   whitening = vec4(axis * inverse.x, vec2(-axis.y, axis.x) * inverse.y);
-  peak = 2.0 * kPi * s1 * s2 * opacity * windowTop(inverse.x) * windowTop(inverse.y);
+  peak = opacity * (2.0 * kPi) * s1 * s2;
+  vec2 top = window(0.0, inverse.x) * window(0.0, inverse.y);
   vec2 widened = inverse * inverse / (1.0 + kPixelVariance * inverse * inverse);
-  level = 2.0 * log(peak / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
+  level = 2.0 * log(peak * top.x / top.y / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
   return `${HEAD}
 uniform sampler2D uGeometry, uHarmonics;
 uniform int uCount, uHarmonicsPerRow;
@@ -124,7 +103,7 @@ uniform float uVariance;
 layout(location = 0) out uvec4 outMean;
 layout(location = 1) out uvec4 outWhitening;
 layout(location = 2) out uvec4 outColor;
-${kind === 'window' ? WINDOW_TOP : ''}${harmonics(degree)}
+${kind === 'window' ? WINDOW : ''}${harmonics(degree)}
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
@@ -204,16 +183,11 @@ float cumulantConstant(float t, float unit, float scale) {
   return exp2(fPeak - dot(z, z) - h.y - h.x);`,
   },
   window: {
-    varyings: ['vec4 fW', 'vec2 fFlat', 'vec4 fU', 'vec4 fV', 'float fPeak'],
-    functions: { vertex: WINDOW_COEFFICIENTS, fragment: WINDOW_POLYNOMIAL },
-    set: `vec2 u = W.xy, v = W.zw;
-  readWindow(u, fFlat.x, fU);
-  readWindow(v, fFlat.y, fV);
-  fW = vec4(u, v);
-  fPeak = peak;`,
-    alpha: `vec2 w = max(abs(vec2(dot(fW.xy, d), dot(fW.zw, d))) - fFlat, 0.0), s = w * w;
-  float V = windowV(s.x, fU) * windowV(s.y, fV), square = V * V;
-  return fPeak / (square * square);`,
+    varyings: ['vec4 fW', 'vec2 fR', 'float fPeak'],
+    functions: { fragment: WINDOW },
+    set: 'fW = W; fR = vec2(length(W.xy), length(W.zw)); fPeak = peak;',
+    alpha: `vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
+  return fPeak * (u.x * v.x) / (u.y * v.y);`,
   },
 };
 
