@@ -41,13 +41,11 @@ def harmonics_of_rows(
         values = torch.nn.functional.pad(values, (0, _AT_ONCE - count))
         above, below = projected(values), projected(-values)
         sums = torch.where(above.colors > 0, above.colors, 1 - below.colors)[:, :count]
-        if len(sums) == 0:
-            channels.append(sums.new_full((len(keys), count), torch.nan))
-            continue
-        found = _keys(above, sizes)
-        places = torch.searchsorted(found, keys).clamp(max=len(found) - 1)
-        there = (found[places] == keys)[:, None]
-        channels.append(torch.where(there, sums.index_select(0, places), torch.nan))
+        found, last = _keys(above, sizes), len(sums)
+        places = torch.searchsorted(found, keys)
+        there = torch.nn.functional.pad(found, (0, 1), value=-1)[places] == keys
+        with_missing = torch.cat([sums, sums.new_full((1, count), torch.nan)])
+        channels.append(with_missing.index_select(0, torch.where(there, places, last)))
     return torch.cat(channels, 1)
 
 

@@ -14,7 +14,10 @@ from ...stages import Splats
 from .arguments import Sizes
 
 _EXTENT = 3.33  # standard deviations in gsplat's radii at most: there an opacity of 1 has fallen to ALPHA_MIN
-_PIXEL_VARIANCE = 1 / 12  # px^2, of a square pixel
+# px^2, of a square pixel. The weight of every footprint but `point` and `mip` is an integral over the pixel, whatever
+# its samples. Around the mean its covariance is that of the Gaussian plus this (tests/test_gsplat.py measures it). Its
+# peak is below 1, which the radii leave out: they are bounds.
+_PIXEL_VARIANCE = 1 / 12
 _LARGEST_RADIUS = 1e9  # px, fits an int32
 
 ROWS = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
