@@ -559,6 +559,23 @@ def test_everything_at_once():
         render(scene, cameras, covars=covars, return_normals=True)
 
 
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("count", [0, 6], ids=["none", "behind"])
+@pytest.mark.parametrize("by_z", [True, False], ids=["z", "distance"])
+def test_without_splats_everything_is_empty(packed, count, by_z):
+    scene, cameras = scene_of(torch.float32, "cpu", degree=1), cameras_of(torch.float32, "cpu")
+    scene["means"] = scene["means"] - 50 * cameras["viewmats"][0, 2, :3]
+    leaves = scenes.leaves({k: v[:count] for k, v in scene.items()})
+    options = {"return_normals": True, "render_mode": "RGB-Ed", "camera_model": "fisheye", "absgrad": True}
+    options |= {"radial_coeffs": torch.zeros(2, 4), "sh_degree": 1, "extra_signals_sh_degree": 1, "packed": packed}
+    options |= {"global_z_order": by_z, "near_plane": 0.1, "far_plane": 40.0}
+    images, _, meta = render(leaves, cameras, extra_signals=leaves["colors"], **options)
+    total = images.sum() + meta["render_extra_signals"].sum() + meta["normals"].sum()
+    total.backward()
+    assert images.shape == (2, HEIGHT, WIDTH, 4) and meta["normals"].shape == (2, HEIGHT, WIDTH, 3)
+    assert total == 0 and all((leaf.grad == 0).all() for leaf in leaves.values())
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [

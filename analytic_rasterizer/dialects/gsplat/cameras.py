@@ -42,7 +42,6 @@ def settings_of(
     far: float,
     camera_model: str,
     coefficients: torch.Tensor | None,
-    sh_degree: int,
     footprint: Footprint,
 ) -> list[GaussianRasterizationSettings]:
     """Settings of all cameras, in the order of their leading dimensions, for `project`.
@@ -74,7 +73,7 @@ def settings_of(
             scale_modifier=1.0,
             viewmatrix=view.mT,
             projmatrix=projection,
-            sh_degree=sh_degree,
+            sh_degree=0,  # `Scene.project` sets it
             campos=position,
             prefiltered=False,
             debug=False,

@@ -11,8 +11,7 @@ import torch
 from ..._C import TILE
 from ...autocast import widened
 from ...footprints import Footprint
-from ...settings import GaussianRasterizationSettings
-from ...stages import Splats, blend, list_tiles, project
+from ...stages import Splats, blend, list_tiles
 from .arguments import (
     RASTERIZE_MODES,
     RENDER_MODES,
@@ -30,9 +29,9 @@ from .arguments import (
     settle_footprint,
 )
 from .cameras import lens_coefficients, settings_of
-from .features import depths_of_rows, harmonics_of_rows, normals_of_rows, values_of_rows
-from .meta import ROWS, KeepAbsolute, Layout, measure, without_culled
+from .meta import KeepAbsolute, Layout, measure, without_culled
 from .ranks import Sharing
+from .scene import Scene
 
 _SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
 
@@ -220,32 +219,28 @@ def rasterization(
         viewmats, Ks, coefficients = sharing.all_cameras(viewmats, Ks, coefficients)
         sizes = dataclasses.replace(own_sizes, cameras=len(viewmats))
     width, height = int(width), int(height)
-    mode = Mode.of(render_mode)
-    wide = camera_model == "fisheye"  # `project` orders and cuts its splats by the distance
-    by_z_of_wide = wide and bool(global_z_order)
+    mode, by_z = Mode.of(render_mode), bool(global_z_order)
+    # `project` cuts a fisheye by the distance.
+    planes = (near_plane, far_plane) if camera_model == "fisheye" and by_z else None
     settings = settings_of(
         viewmats,
         Ks,
         width,
         height,
         near=near_plane,
-        far=math.inf if by_z_of_wide else far_plane,
+        far=far_plane if planes is None else math.inf,
         camera_model=camera_model,
         coefficients=coefficients,
-        sh_degree=sh_degree or 0,
         footprint=settled,
     )
-    shs = signal if signal is not None and mode.colors and sh_degree is not None else None
     if covars is None:
         covariances = {"scales": scales, "rotations": quats}
     else:
         covariances = {"cov3D_precomp": upper_triangle(covars)}
     gaussians = {"means3D": means, "opacities": opacities, **covariances}
-    splats = _project(sizes, settings, gaussians, shs)
-    if wide == bool(global_z_order):
-        depths = depths_of_rows(splats, sizes, means, viewmats, distance=not global_z_order)
-        splats = dataclasses.replace(splats, depths=depths.clamp(min=0))
-    measures = measure(splats, settled, radius_clip, (near_plane, far_plane) if by_z_of_wide else None)
+    scene = Scene(sizes, gaussians, viewmats, settings, camera_model, by_z)
+    splats = scene.ordered(scene.project(signal if mode.colors and sh_degree is not None else None))
+    measures = measure(splats, settled, radius_clip, planes)
     if packed:
         splats, measures = without_culled(splats, measures)
     else:
@@ -259,33 +254,7 @@ def rasterization(
         absolute = layout.to_rows(absolute)
     splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
 
-    features = {}  # by what they are, in the order of the channels
-    if mode.colors:
-        features["colors"] = values_of_rows(splats, sizes, signal) if shs is None else splats.colors
-    if extra is not None and extra.degree is None:
-        features["extra"] = values_of_rows(splats, sizes, extra)
-    elif extra is not None:
-        of_degree = [s._replace(sh_degree=extra.degree) for s in settings]
-
-        def projected(values: torch.Tensor) -> Splats:
-            return _project(sizes, of_degree, gaussians, dataclasses.replace(extra, values=values))
-
-        features["extra"] = harmonics_of_rows(splats, sizes, extra, projected)
-    if return_normals:
-
-        def ray_of(camera: int, positions: torch.Tensor) -> torch.Tensor:
-            if camera_model == "ortho":
-                return settings[camera].viewmatrix.detach()[:3, 2]
-            return positions - settings[camera].campos.detach()
-
-        features["normals"] = normals_of_rows(splats, sizes, means, quats, ray_of)
-    if mode.depth:
-        # Rays of an orthographic camera go along z.
-        distance = mode.distance and camera_model != "ortho"
-        if mode.distance and distance == bool(global_z_order):
-            features["depth"] = depths_of_rows(splats, sizes, means, viewmats, distance)[:, None]
-        else:
-            features["depth"] = splats.depths[:, None]
+    features = scene.features(splats, mode, signal, extra, bool(return_normals))
     channels = {name: rows.shape[1] for name, rows in features.items()}
     rows = torch.cat([splats.means2d.new_empty(len(splats.means2d), 0), *features.values()], 1)
     blended = splats
@@ -328,54 +297,9 @@ def rasterization(
     return images, alphas, meta
 
 
-# --- projection --------------------------------------------------------------------------------------
-
-
-def _project(
-    sizes: Sizes,
-    settings: list[GaussianRasterizationSettings],
-    gaussians: dict[str, torch.Tensor],
-    shs: Signal | None,
-) -> Splats:
-    """Splats of all Gaussians in all cameras; the cameras of batch b are b * C to b * C + C - 1.
-
-    One `project` serves the cameras that see the same Gaussians: those of a batch, unless harmonics are per camera.
-    """
-    batches, dims = math.prod(sizes.batch), len(sizes.batch)
-    flat = {name: value.reshape(batches, *value.shape[dims:]) for name, value in gaussians.items()}
-    per_camera = shs is not None and shs.per_camera
-    harmonics = None if shs is None else shs.values.flatten(0, -4) if shs.values.dim() > 3 else shs.values[None]
-    together = 1 if per_camera else sizes.cameras
-    parts = []
-    for first in range(0, len(settings), together):
-        batch = first // sizes.cameras
-        of_batch = {name: value[batch] for name, value in flat.items()}
-        if harmonics is not None:
-            of_batch["shs"] = harmonics[first if per_camera else batch]
-        parts.append(project(settings[first : first + together], **of_batch))
-    return _join(parts)
-
-
 def upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
     """(..., 6) of (..., 3, 3)."""
     return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
-
-
-def _join(parts: list[Splats]) -> Splats:
-    """Splats of several projections as of one, camera after camera."""
-    if len(parts) == 1:
-        return parts[0]
-    cameras = [0]
-    splits = [parts[0].row_splits[:1]]
-    for part in parts:
-        cameras.append(cameras[-1] + part.cameras)
-        splits.append(splits[-1][-1] + part.row_splits[1:])
-    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in ROWS}
-    rows["camera_ids"] = torch.cat([part.camera_ids + first for part, first in zip(parts, cameras)])
-    return dataclasses.replace(parts[0], row_splits=torch.cat(splits), **rows)
-
-
-# --- blending ----------------------------------------------------------------------------------------
 
 
 def _blend(
