@@ -245,8 +245,10 @@ def test_images_and_gradients_of_a_lens_are_the_rasterizers(device, dtype, name)
     assert_gradients_close(actual, gradients(total, again | views), dtype)
 
 
-@pytest.mark.parametrize("name, by_z", [("opencv", True), ("thin prism fisheye", True), ("thin prism fisheye", False)])
-@pytest.mark.parametrize("mode", ["RGB+D", "RGB-d"])
+@pytest.mark.parametrize(
+    "name, by_z, mode",
+    [("opencv", True, "RGB-d"), ("thin prism fisheye", True, "RGB+D"), ("thin prism fisheye", False, "RGB+D")],
+)
 def test_gradcheck_of_lenses(name, by_z, mode):
     """Of everything, the coefficients included, and through either depth."""
     smooth, cameras = scenes.smooth_scene(5), cameras_of(torch.float64, "cpu")
