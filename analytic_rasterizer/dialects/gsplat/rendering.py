@@ -194,7 +194,7 @@ def rasterization(
             check_distributed(sizes, colors=signal, extra_signals=extra)
         return sizes, signal, extra, settle_footprint(footprint, rasterize_mode, eps2d)
 
-    sharing, coefficients = None, None
+    sharing = None
     if distributed:
         tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
         tensors |= {"viewmats": viewmats, "Ks": Ks, "covars": covars, "extra_signals": extra_signals}
@@ -256,7 +256,7 @@ def rasterization(
 
     features = scene.features(splats, mode, signal, extra, bool(return_normals))
     channels = {name: rows.shape[1] for name, rows in features.items()}
-    rows = torch.cat([splats.means2d.new_empty(len(splats.means2d), 0), *features.values()], 1)
+    rows = torch.cat(list(features.values()), 1) if len(features) > 1 else next(iter(features.values()))
     blended = splats
     if sharing is not None:
         blended, absolute = sharing.send(splats, rows, absolute)
