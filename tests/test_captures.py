@@ -273,7 +273,7 @@ def test_masks_of_nerfstudio(tmp_path):
             frame["mask_path"] = name
 
     write_nerfstudio(tmp_path, add_masks)
-    with pytest.raises(io.SceneError, match="frame 0: mask_path must name a picture beside the file, got .*r.png"):
+    with pytest.raises(io.SceneError, match=r"frame 0: mask_path must name a picture beside the file, got .*r\.png"):
         training.load_capture(tmp_path)
     write_grey(tmp_path / "masks", circle(1, (35, 33)), ["r.png"])
     found = training.load_capture(tmp_path)

@@ -64,8 +64,8 @@ def load_capture(
         offset: What to take off all positions, so that they are those of a scene with this offset. None: what
             `offset_of` finds, which is nothing unless coordinates are far from zero.
 
-    Warns of masks elsewhere, which are ignored, of photographs that are left out because their cameras are far from all others,
-    and of points so near to the cameras that they are not drawn.
+    Warns of masks elsewhere, which are ignored, of photographs that are left out because their cameras are far from all
+    others, and of points so near to the cameras that they are not drawn.
 
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens

@@ -182,7 +182,8 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
     own_height, own_width = levels.shape
     if not (_is_reduced(own_width, own_height, width, height) or _is_reduced(width, height, own_width, own_height)):
         raise io.SceneError(
-            f"{path}: expected a mask of the shape of its picture, {width} x {height} px, got {own_width} x {own_height}"
+            f"{path}: expected a mask of the shape of its picture, {width} x {height} px, got {own_width} x "
+            f"{own_height}"
         )
     counted = 255 * (levels > levels.max() / 2).to(torch.uint8)
     if (own_width, own_height) == (width, height):

@@ -64,8 +64,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With `resume` None, or
-            the same as when the training began.
+        images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
+            `resume` None, or the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
