@@ -1016,7 +1016,7 @@ def test_example_trains(synthetic, tmp_path):
 
 
 def test_evaluate_needs_pictures():
-    empty = pictures.Pictures([], {1: []}, {1: []})
+    empty = pictures.Pictures([], {1: []}, {1: []}, {1: []})
     with pytest.raises(ValueError, match="pictures must have at least one view, got none"):
         evaluate(truth_gaussians().map(torch.Tensor.detach), empty, "box")
 

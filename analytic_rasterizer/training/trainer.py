@@ -18,7 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
-from ..losses import l1_ssim
+from ..losses import counted, l1_ssim
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .extent import extent_of
@@ -81,7 +81,7 @@ class Trainer:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
-        last: Picture and target (`Pictures.target`) of the last step, for looking at.
+        last: Picture and target (`Pictures.target`) of the last step, both black where nothing counts.
         dropped: Gaussians that were taken away because a number of theirs had left float32.
         warnings: Sentences for the user; who has told them empties the list.
     """
@@ -260,11 +260,13 @@ class Trainer:
         gaussians, density = self.gaussians, self.density
         columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
+        mask = self.pictures.mask(shown.scale, shown.view)
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
             mean_columns=columns,
             target=truth,
             dL_dloss=self.one,
+            mask=mask,
             ssim_weight=self.options.ssim_weight,
             bg=shown.settings.bg,
             **self._camera(shown),
@@ -273,7 +275,7 @@ class Trainer:
             field.grad = gradient
         if columns:
             density.observe_gradients(gradients[-1], radii)
-        self.last = image, truth
+        self.last = counted(image, truth, mask)
         return loss, radii > 0 if self.options.sparse_adam else None
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
@@ -292,10 +294,10 @@ class Trainer:
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf() if self._watches(scale) else None
             image, radii = render(gaussians, settings, leaf, options.supersampling)
-            truth = self.pictures.target(scale, view, background)
-            losses.append(l1_ssim(image, truth, options.ssim_weight))
+            truth, mask = self.pictures.target(scale, view, background), self.pictures.mask(scale, view)
+            losses.append(l1_ssim(image, truth, options.ssim_weight, mask))
             seen.append((leaf, radii))
-            self.last = image.detach(), truth
+            self.last = counted(image.detach(), truth, mask)
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
