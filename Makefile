@@ -72,7 +72,7 @@ test-simple-knn: $(VENV)/.installed
 
 # The viewer in chromium and Firefox, which draw in software. Elsewhere than on Debian as root, CHROMIUM and FIREFOX name
 # the browsers. Tests of a browser that is missing are skipped, with the reason.
-BROWSER_TESTS ?= tests/test_viewer.py tests/test_viewer_live.py tests/test_viewer_browser.py tests/test_viewer_firefox.py
+BROWSER_TESTS ?= tests/test_viewer.py tests/test_viewer_live.py tests/test_viewer_webgpu.py tests/test_viewer_browser.py tests/test_viewer_firefox.py
 BROWSER_PACKAGES := chromium firefox-esr xvfb libgl1-mesa-dri libegl1 libgl1
 test-browser: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[test,test-browser]" || echo "no playwright: going on without"

@@ -3,10 +3,10 @@
     pip install moderngl
     python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
 
-The sources of the shaders and their constants are taken from the modules of the page, which node runs; what is around
+The sources of the shaders and their constants are taken from the modules of the page, which node runs. What is around
 them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and blending. Footprints are
-those of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it
-comes from EGL and needs no window.
+those of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00. On Linux
+it comes from EGL and needs no window.
 
 Each picture of the first size, blended in 32-bit floats (as when the camera rests) and in half floats (as when it
 moves), is compared with that of the CPU rasterizer. Frames are then timed in half floats, footprints in turn, round

@@ -98,7 +98,7 @@ def wait_for_frame(page):
 def settle(page):
     """The picture on the screen once it is what was asked for, as PNG."""
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
-    wait_for(page, "() => document.getElementById('surface').ariaBusy === 'false'")
+    wait_for(page, "() => document.getElementById('surface').getAttribute('aria-busy') === 'false'")
     return page.screenshot(type="png")
 
 

@@ -30,6 +30,7 @@ export class Viewer {
     this.rate = null;
     this.losses = 0;
     this.controls = null;
+    this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
     this.paces = new Map();
   }
 
@@ -66,6 +67,7 @@ export class Viewer {
     announce('The graphics device was taken away; waiting for it to come back.');
     if (!failure) await renderer.returned;
     renderer.dispose();
+    this.shown = null;
     if (!(renderer instanceof WebGLRenderer)) this.losses += 1;
     if (failure || this.losses > 1) this.wish = 'webgl';
     try {
@@ -161,6 +163,7 @@ export class Viewer {
 
   /// Of what is on the screen: the divider and the heat map too.
   saveScreenshot() {
+    if (!this.shown) return;
     const name = `${this.meta.name.replace(/\.\w+$/, '')}_${this.state.footprint.replace(/\W+/g, '_')}.png`;
     this.present();
     this.canvas.toBlob(blob => {
@@ -191,7 +194,7 @@ export class Viewer {
     this.again = this.drawing;
     if (!this.controls || this.frameRequested || this.drawing || this.renderer.isLost) return;  // or automation
     this.frameRequested = true;
-    this.surface.ariaBusy = 'true';
+    this.surface.setAttribute('aria-busy', 'true');
     requestAnimationFrame(() => this.frame());
   }
 
@@ -251,7 +254,7 @@ export class Viewer {
     const active = this.moving || this.journey || this.controls.flight();
     if (done) this.noteTime(start, active);
     if (active || this.again || !done) this.wake();
-    else if (!this.shown.moving) this.surface.ariaBusy = 'false';  // what is shown is what is asked for
+    else if (!this.shown.moving) this.surface.setAttribute('aria-busy', 'false');  // what is shown is what is asked for
   }
 
   /// Moves along a journey, or with the keys that are held.
