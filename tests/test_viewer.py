@@ -549,8 +549,8 @@ def test_the_page_finds_footprints_by_name(tmp_path):
 
 PACE = """
 import { Pace } from './pace.js';
-const follow = (milliseconds, frames) => {
-  const pace = new Pace(), divisors = [];
+const follow = (milliseconds, frames, settled = 0) => {
+  const pace = new Pace(settled), divisors = [pace.divisor];
   for (let k = 0; k < frames; ++k) {
     pace.note(milliseconds(pace.divisor, k));
     divisors.push(pace.divisor);
@@ -562,13 +562,15 @@ console.log(JSON.stringify({
   slow: follow(divisor => 10 + 200 / (divisor * divisor), 8),  // 60 ms at 1/2, 22 ms at 1/4
   stubborn: follow(() => 90, 8),                               // nothing is gained
   recovers: follow((divisor, k) => (k < 3 ? 100 / divisor : 4), 12),
+  warned: follow(divisor => 400 / (divisor * divisor), 4, 3000),  // 25 ms at 1/4
 }));
 """
 
 
 def test_pictures_in_motion_are_as_small_as_they_must_be(tmp_path):
     followed = run_node(tmp_path, ["pace.js"], PACE)
-    assert followed["quick"] == [1] * 6
+    assert followed["quick"] == [1] * 7
+    assert followed["warned"] == [4] * 5
     assert followed["slow"][-4:] == [4] * 4
     assert followed["stubborn"][-4:] == [1] * 4
     assert 2 in followed["recovers"] and followed["recovers"][-1] == 1

@@ -32,6 +32,7 @@ export class Viewer {
     this.controls = null;
     this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
     this.paces = new Map();
+    this.settledTime = 0;  // ms
   }
 
   /// Opens a renderer for the scene, which is not here yet.
@@ -281,7 +282,8 @@ export class Viewer {
   async drawFrame() {
     const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
     const left = this.drawn(footprint, moving), right = compare === null ? null : this.drawn(compare, moving);
-    const pace = this.paceOf(left, right), camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
+    const pace = moving ? this.paceOf(left, right) : null;
+    const camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
     const split = right !== null && mode === 'split', column = Math.ceil(divider * camera.width);
     const pictures = [{ name: 'left', footprint: left, span: split ? [0, column] : undefined }];
     if (right !== null) {
@@ -290,7 +292,9 @@ export class Viewer {
     }
     const start = performance.now(), cancelled = () => !moving && this.moving;
     if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
-    if (moving) pace.note(performance.now() - start);
+    const took = performance.now() - start;
+    if (moving) pace.note(took);
+    else this.settledTime = took;
     this.shown = { left: 'left', right: right === null ? null : 'right', camera, moving };
     this.present();
     return true;
@@ -299,7 +303,7 @@ export class Viewer {
   /// The pace at which these footprints can follow the camera.
   paceOf(left, right) {
     const key = `${left.name} ${right?.name}`;
-    if (!this.paces.has(key)) this.paces.set(key, new Pace());
+    if (!this.paces.has(key)) this.paces.set(key, new Pace(this.settledTime));
     return this.paces.get(key);
   }
 

@@ -25,7 +25,7 @@ ${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glsl
 `;
 
 // F(t) of docs/internals/numerics.md, "Logistic window", as numerator and denominator. `r` = 1/sigma [1/px].
-const WINDOW = `
+const GL_WINDOW = `
 float logistic2(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }
 float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
   float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
@@ -103,7 +103,7 @@ uniform float uVariance;
 layout(location = 0) out uvec4 outMean;
 layout(location = 1) out uvec4 outWhitening;
 layout(location = 2) out uvec4 outColor;
-${kind === 'window' ? WINDOW : ''}${harmonics(degree)}
+${kind === 'window' ? GL_WINDOW : ''}${harmonics(degree)}
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
@@ -184,7 +184,7 @@ float cumulantConstant(float t, float unit, float scale) {
   },
   window: {
     varyings: ['vec4 fW', 'vec2 fR', 'float fPeak'],
-    functions: { fragment: WINDOW },
+    functions: { fragment: GL_WINDOW },
     set: 'fW = W; fR = vec2(length(W.xy), length(W.zw)); fPeak = peak;',
     alpha: `vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
   return fPeak * (u.x * v.x) / (u.y * v.y);`,
