@@ -10,15 +10,14 @@ Splats are blended in the library's order, with its thresholds. Harmonics are cu
 - unscented: mean and covariance of seven points through the exact map, at the same samples: (a) alpha 1, beta 0,
   points sqrt(3) standard deviations away, (b) alpha 0.1, beta 2, points a tenth as far.
 - box, moment, analytic: the library's own pictures.
-- pinhole, affine: the same of a pinhole with the same horizontal field of view, against its own truth.
 - undistorted: the truth through the lens in 8 bits, resampled to a pinhole by what `train` does, against the truth of
-  this pinhole, blended in the order of the lens. kept is the share of the picture that is left. Rounding alone costs 59 dB.
+  this pinhole, of the same splats in the same order. Rounding alone costs 59 dB. kept: the share of the picture left.
+- above: the share of the splats drawn whose `affine_error` is above its limit.
 
-- above: the share of the splats drawn whose `affine_error` is above the limit.
-
-Prints PSNR [dB], of mean squares over several scenes of large splats. Then, for Gaussians one at a time, the error of the
-weight by `affine_error`. Random splats have standard deviations of `--sigmas` px in the middle of a fisheye's picture,
-in geometric mean over the axes; all cameras of a field of view see the same scene. --out saves pictures.
+Pinholes have the same horizontal field of view, and are compared with their own truth. All numbers are PSNR [dB], of
+mean squares over several scenes of large splats. Random splats have standard deviations of --sigmas px in the middle of
+a fisheye's picture, in geometric mean over the axes. All cameras of a field of view see the same scene. --out saves
+pictures. A second table has the errors of the weights of single Gaussians by `affine_error`.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,6 +41,7 @@ from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.affine import LIMIT, PIXEL_VARIANCE, affine_error
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors
 from analytic_rasterizer.analysis.tables import markdown_table
+from analytic_rasterizer.effects import NEAR
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
 from analytic_rasterizer.lens import WIDE, Lens
 from analytic_rasterizer.rotations import rotation_matrices
@@ -138,22 +139,22 @@ def random_scene(seed: int, fov: float, sigma: float, size: tuple[int, int] = SI
 class LensSplats(approximations.Splats):
     """What a camera with a lens may show, also beside its picture, in the library's order: see `Splats`.
 
-    mean and conic are those that the library projects; what it does not draw has no weight there. `by_distance`: the
-    order of wide lenses; None: that of the lens.
+    mean and conic are those that the library projects; what it does not draw has no weight there. `like` is the lens
+    whose order this is, and that decides which centres are seen; None: the same lens.
     """
 
-    def __init__(self, scene: Gaussians, view: io.View, lens: Lens, by_distance: bool | None = None):
+    def __init__(self, scene: Gaussians, view: io.View, lens: Lens, like: Lens | None = None):
         self.lens, self.view = lens, view
         middle = [n / 2 if c is None else c for c, n in ((view.cx, view.width), (view.cy, view.height))]
         self.focal, self.principal = torch.tensor([[view.fx, view.fy], middle], dtype=torch.float64)
         turn, shift = view.w2c[:3, :3].double(), view.w2c[:3, 3].double()
         centre = scene.means @ turn.T + shift
-        depth = centre.norm(dim=1) if lens.model in WIDE else centre[:, 2]
+        like = like or lens
+        depth = centre.norm(dim=1) if like.model in WIDE else centre[:, 2]
         angle = torch.atan2(centre[:, :2].norm(dim=1), centre[:, 2])
-        may_show = (depth > ar.effects.NEAR) & (angle <= lens.fold) & (scene.opacities[:, 0] > _C.ALPHA_MIN)
+        may_show = (depth > NEAR) & (angle <= like.fold) & (scene.opacities[:, 0] > _C.ALPHA_MIN)
         ids = may_show.nonzero()[:, 0]
-        order = depth if by_distance is None else centre.norm(dim=1) if by_distance else centre[:, 2]
-        ids = ids[order[ids].argsort(stable=True)]
+        ids = ids[depth[ids].argsort(stable=True)]
         self.scene, self.centre, self.opacity = scene.rows(ids), centre[ids], scene.opacities[ids, 0]
         self.color = colors(self.scene)
         self.axes = turn @ rotation_matrices(self.scene.rotations) * self.scene.scales[:, None]
@@ -264,7 +265,7 @@ def undistort(scene: Gaussians, view: io.View, lens: Lens, truth: torch.Tensor, 
     known = PhotographLens("RADIAL", BARREL) if lens is CAMERAS["perspective"] else Bent(lens)
     rgba = torch.cat([truth, torch.ones_like(truth[:1])]).clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0)
     pinhole, resampled = without_lens(rgba, view, known)
-    straight = render_whole(LensSplats(scene, pinhole, CAMERAS["pinhole"], lens.model in WIDE), "ahead", samples)
+    straight = render_whole(LensSplats(scene, pinhole, CAMERAS["pinhole"], lens), "ahead", samples)
     kept = float(window_of(known, view).kept)
     return resampled[..., :3].permute(2, 0, 1).double() / 255, straight, kept
 
@@ -379,7 +380,7 @@ def weight_errors(kind: str, count: int, samples: int) -> tuple[torch.Tensor, to
 
 def weight_table(args: argparse.Namespace) -> list[dict]:
     """A row for every range of `affine_error`, printed: median, 95% and largest error of a weight by camera."""
-    rows = [{"from": low, "to": high} for low, high in zip(EDGES, EDGES[1:])]
+    rows = [{"from": low, "to": high} for low, high in pairwise(EDGES)]
     for kind in CAMERAS:
         error, worst = weight_errors(kind, args.gaussians, args.samples)
         for row in rows:
