@@ -431,7 +431,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--sigmas", nargs="+", type=float, default=SIGMAS, help="px")
     add("--size", nargs=2, type=int, default=SIZE, metavar=("W", "H"))
     add("--scenes", type=int, help="random scenes per row (default: 1 to 4, more of large splats)")
-    add("--gaussians", type=int, default=2000, help="of the table of weights (default: %(default)s)")
+    add("--gaussians", type=int, default=600, help="of the table of weights (default: %(default)s)")
     add("--samples", type=int, default=4, metavar="N", help="rays along a pixel's side (default: 4)")
     add("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
     add("--out", help="folder for pictures")
