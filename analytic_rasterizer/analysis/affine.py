@@ -17,7 +17,7 @@ from ..lens import WIDE, Lens
 from ..rotations import product, rotation_matrices
 from ..settings import GaussianRasterizationSettings
 
-LIMIT = 0.3  # of `affine_error`: from here on the largest error of a weight is about 0.1
+LIMIT = 0.3  # of `affine_error`: there a weight is off by 0.1 to 0.3 at most
 PIXEL_VARIANCE = 1 / 12  # px^2, of a pixel's own width
 _ROWS = 2**18  # that are computed at a time
 
@@ -29,7 +29,7 @@ def affine_error(scene: Gaussians, settings: GaussianRasterizationSettings) -> t
     J is the derivative at the centre, A = (a_1, a_2, a_3) the Gaussian's axes times its standard deviations, and S the
     covariance that the splat has in the picture, J A A^T J^T, plus that of a pixel. A step of one standard deviation
     along an axis changes J by D. The number is the largest |S^(-1/2) D A| / sqrt(2) (Frobenius) over the six steps: 1
-    where the change is as large as the splat. It is about three times the largest error of the splat's weight.
+    where the change is as large as the splat. The splat's weight is off by at most about as much, mostly by a third.
 
     A pinhole counts as a lens without coefficients. The clamp of J beside the picture (`Lens.reach`) is left out.
 
@@ -39,8 +39,8 @@ def affine_error(scene: Gaussians, settings: GaussianRasterizationSettings) -> t
 
     Returns:
         (P,) float64 on the CPU, not negative. Infinite where a step leaves what the camera sees, NaN where the centre
-        is not seen: nearer than `Effects.near`, or beyond the angle at which the map folds back. Both sides of the
-        picture count as seen.
+        is not seen: nearer than `Effects.near`, or beyond the angle at which the map folds back. What is beside the
+        picture counts as seen.
 
     Raises:
         TypeError: scene or settings has a wrong type.
