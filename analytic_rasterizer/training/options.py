@@ -12,6 +12,7 @@ from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.common import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
+EXPOSURES = ("none", "affine")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 RANDOM_BACKGROUND = "random"
 
@@ -103,6 +104,8 @@ class TrainingOptions:
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
+        exposure: "affine": learn a colour correction (3x4) for each training photograph, for captures whose exposure or
+            white balance varies. It is applied before the loss; the scene has no correction. "none": none.
         seed: Of the starting points, the order of the pictures, and everything else that is drawn; -2^39 to 2^40 - 1.
         random_points: Gaussians at the start where the capture has no points; not more than `max_gaussians`. 0:
             100,000, or `max_gaussians` where that is less.
@@ -122,6 +125,9 @@ class TrainingOptions:
         sparse_adam: Whether a step of the optimizer updates only the Gaussians that at least one of its pictures shows
             (3DGS's radii > 0), as 3DGS's `--optimizer_type sparse_adam` does. The others keep parameters and moments,
             whatever regularizers would do to them.
+        deterministic: Whether every run has the same bits on CUDA too, whose frames with a sudden rise of pairs else
+            may differ in the last bits: torch's deterministic mode is on during every step, so that the host waits for
+            the number of pairs. Operators of torch without a deterministic algorithm would warn.
         density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
             absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
         densify_from: Time before the first change; -1: 500 steps, or a fourteenth of a training of fewer than 7,000. In
@@ -163,6 +169,7 @@ class TrainingOptions:
     sh_every: int = 1000
     background: str = ""
     filter_3d: bool = False
+    exposure: str = "none"
     seed: int = 0
     random_points: int = 0
     ssim_weight: float = 0.2
@@ -178,6 +185,7 @@ class TrainingOptions:
     rates_from: float = 7000.0
     rates_half_life: int = 7000
     sparse_adam: bool = False
+    deterministic: bool = False
     density: str = "absgrad"
     densify_from: float = -1.0
     densify_until: float = 0.75
@@ -222,6 +230,7 @@ class TrainingOptions:
         _check("background", self.background in known, f"one of {', '.join(known[1:])}", self.background)
         expected = f"one of {', '.join(DOWNSAMPLINGS)}"
         _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
+        _check("exposure", self.exposure in EXPOSURES, f"one of {', '.join(EXPOSURES)}", self.exposure)
         _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
         limited = self.density != "mcmc" or self.max_gaussians > 0
         _check(
