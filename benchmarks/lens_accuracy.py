@@ -10,8 +10,9 @@ Splats are blended in the library's order, with its thresholds. Harmonics are cu
 - unscented: mean and covariance of seven points through the exact map, at the same samples: (a) alpha 1, beta 0,
   points sqrt(3) standard deviations away, (b) alpha 0.1, beta 2, points a tenth as far.
 - box, moment, analytic: the library's own pictures.
-- undistorted: the truth through the lens in 8 bits, resampled to a pinhole by what `train` does, against the truth of
-  this pinhole, of the same splats in the same order. Rounding alone costs 59 dB. kept: the share of the picture left.
+- undistorted: the truth through the lens in 8 bits, resampled to a pinhole by `train --lens undistort`, against the
+  truth of this pinhole, of the same splats in the same order. Rounding alone costs 59 dB. kept: the share of the
+  picture left.
 - above: the share of the splats drawn whose `affine_error` is above its limit.
 
 Pinholes have the same horizontal field of view, and are compared with their own truth. All numbers are PSNR [dB], of
@@ -24,7 +25,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,8 +46,7 @@ from analytic_rasterizer.effects import NEAR
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
 from analytic_rasterizer.lens import WIDE, Lens
 from analytic_rasterizer.rotations import rotation_matrices
-from analytic_rasterizer.training.lenses import Lens as PhotographLens
-from analytic_rasterizer.training.lenses import window_of, without_lens
+from analytic_rasterizer.training.undistortion import window_of, without_lens
 
 SIZE = 128, 96
 FOVS, SIGMAS = (60, 90, 120, 150, 180), (0.5, 3.0, 20.0)  # degrees from the left to the right edge; px
@@ -240,33 +240,13 @@ def library_picture(scene: Gaussians, view: io.View, lens: Lens, footprint: str)
     return rasterizer(means2D=None, colors_precomp=colors(scene), **arguments)[0]
 
 
-@dataclass(frozen=True)
-class Bent:
-    """A lens of the library, as `without_lens` takes one of a photograph."""
-
-    lens: Lens
-
-    @property
-    def model(self) -> str:
-        return self.lens.model
-
-    def distorted(self, a, b) -> tuple:
-        x, y = torch.broadcast_tensors(torch.as_tensor(a).double(), torch.as_tensor(b).double())
-        u = seen(self.lens, torch.stack([x, y, torch.ones_like(x)], -1))[0]
-        return tuple(of.numpy() if isinstance(a, np.ndarray) else of.float() for of in u.unbind(-1))
-
-    def factor(self, r2) -> np.ndarray:
-        r = np.sqrt(r2)
-        return np.where(r > 0, self.distorted(r, np.zeros_like(r))[0] / np.maximum(r, 1e-30), 1.0)
-
-
 def undistort(scene: Gaussians, view: io.View, lens: Lens, truth: torch.Tensor, samples: int):
     """The pinhole's picture out of the lens's (3, H, W), the pinhole's truth, and the share of the picture kept."""
-    known = PhotographLens("RADIAL", BARREL) if lens is CAMERAS["perspective"] else Bent(lens)
+    bent = replace(view, lens=lens)
     rgba = torch.cat([truth, torch.ones_like(truth[:1])]).clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0)
-    pinhole, resampled = without_lens(rgba, view, known)
+    pinhole, resampled = without_lens(rgba, bent)
     straight = render_whole(LensSplats(scene, pinhole, CAMERAS["pinhole"], lens), "ahead", samples)
-    kept = float(window_of(known, view).kept)
+    kept = float(window_of(bent).kept)
     return resampled[..., :3].permute(2, 0, 1).double() / 255, straight, kept
 
 
