@@ -31,7 +31,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import approximations
-import numpy as np
 import torch
 from approximations import Variant, affine_alphas, alphas_and_depths, render
 from common import save_json
@@ -62,8 +61,6 @@ CAMERAS = {"fisheye": Lens.fisheye(), "perspective": Lens.perspective(BARREL), "
 UNSCENTED = {"unscented (a)": (1.0, 0.0), "unscented (b)": (0.1, 2.0)}  # alpha, beta
 COLUMNS = ("affine", *UNSCENTED, *FOOTPRINTS, "above", "undistorted", "kept")
 NOWHERE = 1e9  # px, of splats that the library does not draw
-ROUNDS, CLOSE = 40, 1e-11  # of Newton's method, and where it ends, in focal lengths
-STEP = 0.2  # rad, the largest of Newton's method
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, math.inf)  # of `affine_error`, in the last table
 FOCAL = 100.0  # px, of the last table, as the three below
 WIDEST = {"fisheye": 110, "perspective": 45, "pinhole": 60}  # degrees from the axis
@@ -75,36 +72,6 @@ def seen(lens: Lens, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Where points (..., 3) in camera space are seen, (..., 2) in focal lengths, and the derivatives (..., 2, 3)."""
     u, slopes = _C.lens_points(lens.model, list(lens.coefficients), points.reshape(-1, 3))
     return u.reshape(*points.shape[:-1], 2), slopes.reshape(*points.shape[:-1], 2, 3)
-
-
-def rays_through(lens: Lens, u: torch.Tensor) -> torch.Tensor:
-    """(N, 3) unit vectors of what is seen at u (N, 2), in focal lengths; NaN where the lens sees nothing.
-
-    Newton's method on the sphere, from the angle at which a lens without tangential terms sees the same radius.
-    """
-    angles = torch.linspace(0, lens.fold, 4096, dtype=torch.float64)
-    radii = seen(lens, torch.stack([angles.sin(), 0 * angles, angles.cos()], 1))[0][:, 0]
-    radius = u.norm(dim=1, keepdim=True)
-    angle = torch.from_numpy(np.interp(radius.numpy(), radii.numpy(), angles.numpy()))
-    ray = torch.cat([angle.sin() * u / radius.clamp_min(1e-300), angle.cos()], 1)
-    open_ = torch.arange(len(u))
-    for _ in range(ROUNDS):
-        p = ray[open_]
-        at, slopes = seen(lens, p)
-        left = u[open_] - at
-        moving = left.norm(dim=1) > CLOSE
-        open_, p, left, slopes = open_[moving], p[moving], left[moving], slopes[moving]
-        if not len(open_):
-            break
-        # J is of rank 2, and zero along p: the shortest step that solves J step = left is J^T (J J^T)^-1 left.
-        xx, xy, yy = ((slopes[:, i] * slopes[:, k]).sum(1) for i, k in ((0, 0), (0, 1), (1, 1)))
-        x, y = yy * left[:, 0] - xy * left[:, 1], xx * left[:, 1] - xy * left[:, 0]
-        step = (x[:, None] * slopes[:, 0] + y[:, None] * slopes[:, 1]) / (xx * yy - xy * xy)[:, None]
-        step = step * (STEP / step.norm(dim=1, keepdim=True)).clamp_max(1)
-        ray[open_] = torch.nn.functional.normalize(p + step, dim=1)
-    outside = torch.atan2(ray[:, :2].norm(dim=1), ray[:, 2]) > lens.fold
-    outside[open_] = True
-    return torch.where(outside[:, None], math.nan, ray)
 
 
 def camera(kind: str, fov: float, size: tuple[int, int] = SIZE, pose: torch.Tensor | None = None) -> io.View:
@@ -125,7 +92,7 @@ def random_scene(seed: int, fov: float, sigma: float, size: tuple[int, int] = SI
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, dtype=torch.float64, generator=generator)
 
-    rays = rays_through(CAMERAS["fisheye"], (rand(count, 2) - 0.5) * sides / view.fx)
+    rays = CAMERAS["fisheye"].unproject((rand(count, 2) - 0.5) * sides / view.fx)
     known = ~rays[:, 0].isnan()  # the picture of a fisheye is a disc
     distance = DISTANCES[0] + (DISTANCES[1] - DISTANCES[0]) * rand(count, 1)
     stretch = STRETCH ** (2 * rand(count, 3) - 1)
@@ -205,7 +172,7 @@ class LensSplats(approximations.Splats):
         self.extent = (level[:, None] * torch.stack([xx, yy], 1)).clamp_min(0).sqrt()
 
     def rays(self, pixels: torch.Tensor) -> torch.Tensor:
-        rays = rays_through(self.lens, (pixels + 0.5 - self.principal) / self.focal)
+        rays = self.lens.unproject((pixels + 0.5 - self.principal) / self.focal)
         if rays.isnan().any():
             raise SystemExit(f"the picture of {self.view.name} is wider than what its lens sees")
         return rays
@@ -351,7 +318,7 @@ def weight_errors(kind: str, count: int, samples: int) -> tuple[torch.Tensor, to
     worst = torch.zeros(count, dtype=torch.float64)
     for i in range(count):
         pixels = (splats.mean[i] + disc @ widths[i].T)[:, None] + inside
-        rays, ids = rays_through(lens, pixels.reshape(-1, 2) / FOCAL), torch.tensor([i])
+        rays, ids = lens.unproject(pixels.reshape(-1, 2) / FOCAL), torch.tensor([i])
         true = alphas_and_depths(splats, ids, rays, "ahead")[0].view(len(disc), -1).mean(1)
         affine = affine_alphas(splats, ids, pixels.reshape(-1, 2)).view(len(disc), -1).mean(1)
         worst[i] = (true - affine).abs().nan_to_num().max()  # NaN where the lens sees nothing

@@ -87,7 +87,7 @@ def _errors(lens: Lens, focal: torch.Tensor, near: float, centres: torch.Tensor,
 
 def _slopes(lens: Lens, focal: torch.Tensor, near: float, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """(P, 2, 3) px by world units, the derivative at points (P, 3) in camera space, and (P,) whether they are seen."""
-    coefficients = torch.as_tensor(lens.coefficients, dtype=torch.float64).detach().tolist()
+    coefficients = list(lens.numbers())
     slopes = _C.lens_points(lens.model, coefficients, points)[1]
     depth = points.norm(dim=1) if lens.model in WIDE else points[:, 2]
     angle = torch.atan2(torch.hypot(points[:, 0], points[:, 1]), points[:, 2])
