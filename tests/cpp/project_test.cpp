@@ -230,6 +230,7 @@ template <class Cam> void expect_gradients_match_differences(const Footprint& f,
         near_edge(view.y / view.z, center.y, loss.camera.limit.y) ||
         near_edge(std::hypot(view.x, view.y) / view.z, 0, at.lens.reach) ||
         near_edge(std::atan2(std::hypot(view.x, view.y), view.z), 0, at.lens.reach) ||
+        near_edge(std::hypot(view.x, view.z) / std::sqrt(dot(view, view)), 0, 1 / at.lens.reach) ||
         seen.gap < 0.1 * seen.wide * seen.wide) {
       continue;
     }
