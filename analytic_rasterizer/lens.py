@@ -146,7 +146,8 @@ class Lens:
         if self.reach is not None:
             return self
         if self.model == SPHERE:  # a pixel is 2 tanfovy / height radians high
-            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(float(tangents[1]) / height, 1.5))
+            tangent = tangents[1].item() if isinstance(tangents[1], torch.Tensor) else float(tangents[1])
+            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(tangent / height, 1.5))
         numbers = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
         reach = _reach(self.model, self._values(), *numbers)
         return Lens(self.model, self.coefficients, reach)

@@ -20,10 +20,11 @@ from .effects import Effects
 from .lens import SPHERE
 from .settings import one_number, whole_number
 
-# Standard deviations along a row of pixels, in turns. Wider splats are narrowed to the first: around the whole turn
-# they vary by a thirtieth at most. Narrower than the second, copies do not overlap: exp(-32) is below the rounding.
-_WIDEST, _OVERLAPPING = 0.5, 0.125
+# Standard deviations along a row of pixels, in turns. Wider splats are narrowed to the first: their copies together
+# vary by 2% at most around the turn. Narrower than the second, copies do not overlap: exp(-32) is rounding.
+_WIDEST, _OVERLAPPING = 0.75, 0.125
 _OPAQUE = 1 - 1e-6  # the logarithm of 1 - opacity has to be finite
+_STEPS = 6  # of Newton's method, for the opacity of copies
 
 
 def has_seam(settings: Any) -> bool:
@@ -46,9 +47,10 @@ def turns_of(cameras: Sequence[Any], like: torch.Tensor) -> torch.Tensor | None:
             turns.append(like.new_tensor(math.inf))
             continue
         tangent = s.tanfovx
-        if one_number("tanfovx", tangent) > math.pi * (1 + 1e-6):
-            raise ValueError(f"tanfovx of an equirectangular picture must be at most pi, a turn, got {float(tangent)}")
-        tangent = tangent if isinstance(tangent, torch.Tensor) else like.new_tensor(float(tangent))
+        number = one_number("tanfovx", tangent.detach() if isinstance(tangent, torch.Tensor) else tangent)
+        if number > math.pi * (1 + 1e-6):
+            raise ValueError(f"tanfovx of an equirectangular picture must be at most pi, a turn, got {number}")
+        tangent = tangent if isinstance(tangent, torch.Tensor) else like.new_tensor(number)
         turns.append(math.pi * whole_number("image_width", s.image_width) / tangent.reshape(()).to(like))
     return torch.stack(turns)
 
@@ -119,14 +121,28 @@ def with_copies(
 
 
 def _of_one_copy(opacities: torch.Tensor, xx: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-    """The opacity o with sum_k w_k ln(1 - o) = ln(1 - opacity), where w_k is the splat's falloff at k turns."""
+    """The opacity o with prod_k (1 - o w_k) = 1 - opacity, where w_k is the splat's falloff at k turns.
+
+    In x = -ln(1 - o) the logarithm of the product is concave: Newton's method rises to the solution.
+    """
     overlap = xx > (_OVERLAPPING * turn) ** 2
     if not overlap.any():
         return opacities
     square = torch.where(overlap, turn**2 / torch.where(overlap, 2 * xx, 1), 1)
-    weights = 1 + 2 * sum((-(k**2) * square).exp() for k in (1, 2, 3))
-    light = torch.log1p(-opacities.clamp(max=_OPAQUE))
-    return torch.where(overlap, -torch.expm1(light / weights), opacities)
+    falloff = torch.stack([(-(k**2) * square).exp() for k in range(1, 5)])
+    wanted = -torch.log1p(-opacities.clamp(max=_OPAQUE))
+
+    def newton(x: torch.Tensor) -> torch.Tensor:
+        light = (-x).exp()
+        left = 1 - falloff * (1 - light)
+        slope = 1 + 2 * (falloff * light / left).sum(0)
+        return x + (wanted - x + 2 * left.log().sum(0)) / slope.detach()
+
+    with torch.no_grad():
+        x = wanted / (1 + 2 * falloff.sum(0))
+        for _ in range(_STEPS):
+            x = newton(x)
+    return torch.where(overlap, -torch.expm1(-newton(x)), opacities)  # the last step has the derivative
 
 
 def _places(s: Any, xx: torch.Tensor, turn: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

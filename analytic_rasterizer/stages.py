@@ -34,7 +34,7 @@ class Splats:
     """Projected Gaussians: a row for every Gaussian that a camera may see, camera after camera, Gaussians ascending.
 
     In an equirectangular picture a Gaussian has a row for every place at which it may show: two at the seam, up to
-    five near a pole.
+    six near a pole.
 
     N is the number of rows, C that of cameras. The first five members are differentiable in what `project` was given.
 

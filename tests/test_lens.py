@@ -247,11 +247,11 @@ def test_a_lens_must_be_one():
 
 
 def around(seed, count, sigma=(0.02, 0.5)):
-    """Gaussians in all directions from the camera, nearest 1 and farthest 4 world units away; some on the poles."""
+    """Gaussians in all directions from the camera, nearest 1 and farthest 4 world units away; some almost on the poles."""
     generator = torch.Generator().manual_seed(seed)
     scene = scenes.cast(scenes.random_scene(seed, count, degree=1, sigma=sigma), torch.float64, "cpu")
     direction = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=1)
-    direction[0], direction[1] = torch.tensor([[0.0, 1, 0], [0, -1, 0]], dtype=torch.float64)
+    direction[0], direction[1] = torch.tensor([[1e-3, 1, -2e-3], [-1e-9, -1, 0]], dtype=torch.float64)
     direction[2], direction[3] = torch.tensor([[0.0, 0, -1], [-1e-9, 0.3, -1]], dtype=torch.float64)  # on the seam
     distance = 1 + 3 * torch.rand(count, 1, dtype=torch.float64, generator=generator)
     return scene | {"means3D": distance * direction}
@@ -312,11 +312,16 @@ def by_the_formulas(scene, settings):
     to_pixel = jacobian @ settings.viewmatrix[:3, :3].T
     cov = to_pixel @ reference.covariance_3d(scene["scales"], scene["rotations"], 1.0) @ to_pixel.transpose(1, 2)
     means = textbook(SPHERE, p) * focal + torch.tensor([width, height]) / 2 - 0.5
-    # Splats wider than half a turn are narrowed, and the copies of a splat are together as opaque as it is.
-    narrowing = (turn / 2 / cov[:, 0, 0].sqrt()).clamp(max=1)
+    # Splats wider than 3/4 of a turn are narrowed, and the copies of a splat are together as opaque as it is.
+    narrowing = (0.75 * turn / cov[:, 0, 0].sqrt()).clamp(max=1)
     cov2d = torch.stack([cov[:, 0, 0] * narrowing**2, cov[:, 0, 1] * narrowing, cov[:, 1, 1]], 1)
-    share = sum(torch.exp(-((k * turn) ** 2) / (2 * cov2d[:, 0])) for k in range(-3, 4))
-    opacities = 1 - (1 - scene["opacities"][:, 0]) ** (1 / share)
+    falloff = [torch.exp(-((k * turn) ** 2) / (2 * cov2d[:, 0])) for k in range(-4, 5)]
+    low, high = torch.zeros(2, len(p), dtype=torch.float64)
+    high = high + 1
+    for _ in range(60):
+        opacities = (low + high) / 2
+        opaque = 1 - math.prod(1 - opacities * w for w in falloff) > scene["opacities"][:, 0]
+        low, high = torch.where(opaque, low, opacities), torch.where(opaque, opacities, high)
     colors = reference.sh_color(1, scene["shs"], scene["means3D"] - settings.campos)
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     color, light = torch.zeros(3, height, width, dtype=torch.float64), torch.ones(height, width, dtype=torch.float64)
@@ -348,9 +353,12 @@ def moved_quarter():
 
 
 @pytest.mark.parametrize("axis", [1, -1])
-def test_a_splat_on_a_pole_is_a_cap(axis):
-    """As opaque in every column as a disc about the pole is, and once: copies do not add up."""
-    sigma, opacity = 0.25, 0.7
+@pytest.mark.parametrize("opacity, tolerance", [(0.1, 2 / 255), (0.7, 0.07)])
+def test_a_splat_on_a_pole_is_a_cap(axis, opacity, tolerance):
+    """As opaque in every column as a disc about the pole is, and once: copies do not add up, but for second powers of
+    the opacity, away from the pole, and for what a copy below 1/255 leaves out. Without a correction the poles would be
+    at 0.17 and 0.9."""
+    sigma = 0.25
     one = torch.ones(1, 3, dtype=torch.float64)
     _, _, outputs = ar.GaussianRasterizer(sphere(96, 48, footprint="point:dilation=0", alpha=True))(
         means3D=torch.tensor([[0.0, 2.0 * axis, 0]], dtype=torch.float64),
@@ -364,8 +372,10 @@ def test_a_splat_on_a_pole_is_a_cap(axis):
     from_pole = rows if axis < 0 else math.pi - rows
     expected = opacity * torch.exp(-0.5 * (from_pole / sigma) ** 2)
     shown = (expected > 0.02).nonzero()[:, 0]
+    at_pole = outputs.alpha[0, 0 if axis < 0 else -1]
+    torch.testing.assert_close(at_pole, torch.full_like(at_pole, opacity), rtol=0.01, atol=1.5 / 255)
     torch.testing.assert_close(
-        outputs.alpha[0, shown], expected[shown, None].expand(-1, 96).double(), rtol=0.02, atol=0.01
+        outputs.alpha[0, shown], expected[shown, None].expand(-1, 96).double(), rtol=0, atol=tolerance
     )
 
 
@@ -444,7 +454,9 @@ def test_gradients_of_means2d_count_every_copy():
     for columns in (3, 4):
         scene["means2D"] = torch.full((40, columns), math.nan, dtype=torch.float64).requires_grad_()  # is not read
         color, _ = rasterize(**scene)
-        gradients[columns], by_principal = torch.autograd.grad((color * g).sum(), [scene["means2D"], principal])
+        gradients[columns], by_principal = torch.autograd.grad(
+            (color * g).sum(), [scene["means2D"], principal], retain_graph=True
+        )
         torch.testing.assert_close(gradients[columns][:, :2].sum(0) / half, by_principal, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(gradients[3][:, :2], gradients[4][:, :2])
     assert (gradients[3][:, 2] == 0).all()
@@ -486,7 +498,7 @@ def test_the_nearest_is_in_front(lens, angle):
     a = math.radians(angle)
     direction = torch.tensor([[math.sin(a), 0, math.cos(a)]], dtype=torch.float64)
     distance = torch.tensor([[3.0], [1], [2]], dtype=torch.float64)
-    settings = settings_of(lens, fx=7.0, fy=7.0, cx=24.0, cy=18.0, depth=True, median_depth=True, alpha=True)
+    settings = settings_of(lens, fx=8.0, fy=8.0, cx=24.0, cy=18.0, depth=True, median_depth=True, alpha=True)
     rasterize = ar.GaussianRasterizer(settings)
     color, _, outputs = rasterize(
         means3D=distance * direction,
@@ -496,7 +508,7 @@ def test_the_nearest_is_in_front(lens, angle):
         opacities=torch.ones(3, 1, dtype=torch.float64),
         colors_precomp=torch.eye(3, dtype=torch.float64),
     )
-    full = (outputs.alpha[0] > 0.999).nonzero()
+    full = (outputs.alpha[0] > 0.99).nonzero()
     assert len(full)
     for row, column in full.tolist():
         assert color[:, row, column].argmax() == 1
