@@ -247,7 +247,7 @@ def test_a_lens_must_be_one():
 
 
 def around(seed, count, sigma=(0.02, 0.5)):
-    """Gaussians in all directions from the camera, nearest 1 and farthest 4 world units away; some almost on the poles."""
+    """Gaussians in all directions from the camera, 1 to 4 world units away; two of them almost on the poles."""
     generator = torch.Generator().manual_seed(seed)
     scene = scenes.cast(scenes.random_scene(seed, count, degree=1, sigma=sigma), torch.float64, "cpu")
     direction = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=1)
@@ -546,6 +546,35 @@ def test_stages_and_features_show_the_seam_too():
         colors_precomp=channels[:, 3:].repeat(1, 2)[:, :3].contiguous(),
     )
     torch.testing.assert_close(color[3:], first[:2])
+
+
+def test_the_sphere_in_single_precision(device):
+    """Also next to the poles and at the seam, in the picture and in gradients."""
+    scene, results = around(9, 100), []
+    g = torch.rand(4, 32, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
+    for dtype, where in ((torch.float64, "cpu"), (torch.float32, device)):
+        leaves = scenes.leaves(scenes.cast(scene, dtype, where))
+        settings = ar.camera_settings(
+            moved_quarter(), 64, 32, 64 / (2 * math.pi), 32 / math.pi, sh_degree=1, dtype=dtype, device=where,
+            footprint="box:samples=4", effects=ar.Effects(lens=SPHERE, depth=True),
+        )  # fmt: skip
+        loss = loss_of(leaves, settings, g.to(where, dtype))
+        grads = torch.autograd.grad(loss, list(leaves.values()))
+        results.append({name: grad.double().cpu() for name, grad in zip(leaves, grads)} | {"loss": loss.double().cpu()})
+    for name, expected in results[0].items():
+        error = (results[1][name] - expected).norm() / expected.norm()
+        assert error < 1e-4, (name, error.item())
+
+
+def test_filters_and_the_drop_in_go_around_the_sphere():
+    drop_in = pytest.importorskip("diff_gaussian_rasterization")
+    scene = around(10, 30)
+    filter_3d = torch.linspace(0, 0.3, 30, dtype=torch.float64)
+    settings = sphere(filter_3d=filter_3d)
+    filtered = dict(zip(("scales", "opacities"), ar.apply_3d_filter(scene["scales"], scene["opacities"], filter_3d)))
+    expected, _ = ar.GaussianRasterizer(sphere())(**scene | filtered)
+    for rasterizer in (ar.GaussianRasterizer, drop_in.GaussianRasterizer):
+        torch.testing.assert_close(rasterizer(settings)(**scene)[0], expected)
 
 
 def test_what_the_sphere_refuses():

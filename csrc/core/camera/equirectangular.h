@@ -2,7 +2,7 @@
 // w / (2 pi), h / pi px. core/camera.h, motion.h and defocus.h call it.
 //
 // Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude): nearer
-// to a pole all derivatives are those at the latitude where it is reached (docs/internals/numerics.md, "Lenses"). So a
+// to a pole all derivatives are those at the latitude where it is reached (docs/internals/numerics.md, "Equirectangular pictures"). So a
 // pole itself has a finite Jacobian and finite gradients.
 #pragma once
 
