@@ -1,9 +1,9 @@
 // The equirectangular picture: columns are longitudes, rows are latitudes; the whole sphere has a focal length of
 // w / (2 pi), h / pi px. core/camera.h, motion.h and defocus.h call it.
 //
-// Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude): nearer
-// to a pole all derivatives are those at the latitude where it is reached (docs/internals/numerics.md, "Equirectangular pictures"). So a
-// pole itself has a finite Jacobian and finite gradients.
+// Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude). Nearer
+// to a pole all derivatives are those at the latitude where it is reached, so that a pole itself has a finite Jacobian
+// and finite gradients (docs/internals/numerics.md, "Equirectangular pictures").
 #pragma once
 
 #include "core/camera/lens_model.h"
