@@ -229,7 +229,6 @@ def test_devices_and_precisions_agree(device, lens):
         (lambda: ar.Lens("equirectangular", torch.zeros(12)), "coefficients of an equirectangular lens must be zero"),
         (lambda: ar.Lens("equirectangular", (), 1.6), "reach of an equirectangular lens must be below pi/2"),
         (lambda: ar.Effects(lens=ar.Lens.fisheye(), orthographic=True), "lens must be None for an orthographic"),
-        (lambda: ar.compute_3d_filter(torch.zeros(2, 3), [settings_of(ar.Lens.fisheye())]), "got a fisheye lens"),
     ],
 )
 def test_what_is_refused(make, match):
@@ -548,6 +547,15 @@ def test_stages_and_features_show_the_seam_too():
     torch.testing.assert_close(color[3:], first[:2])
 
 
+def test_directions_of_pixels_of_the_sphere():
+    view = ar.View("v", 64, 32, 64 / (2 * math.pi), 32 / math.pi, torch.eye(4, dtype=torch.float64), lens=SPHERE)
+    points = torch.nn.functional.normalize(
+        torch.randn(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), dim=1
+    )
+    torch.testing.assert_close(view.rays_of(view.pixels_of(points)), points, rtol=0, atol=1e-12)
+    assert view.rays_of(torch.tensor([[3.0, -0.1], [3.0, 32.1]])).isnan().all()  # beyond the poles
+
+
 def test_the_sphere_in_single_precision(device):
     """Also next to the poles and at the seam, in the picture and in gradients."""
     scene, results = around(9, 100), []
@@ -594,6 +602,8 @@ def test_what_the_sphere_refuses():
         rasterize(sphere())(**scene | {"means2D": torch.zeros(10, 3)})
     with pytest.raises(ValueError, match="exactly one of shs and colors_precomp must be given, got both"):
         rasterize(sphere())(**scene, colors_precomp=scene["means3D"])
+    with pytest.raises(ValueError, match="cameras must have no equirectangular lens"):
+        ar.compute_3d_filter(scene["means3D"], [sphere()])
     del scene["means2D"]
     with pytest.raises(ValueError, match="lens must not be equirectangular here"):
         ar.render_stages(sphere(), **scene)
