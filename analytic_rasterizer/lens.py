@@ -158,9 +158,11 @@ class Lens:
         return positions, derivatives
 
     def unproject(self, positions: torch.Tensor) -> torch.Tensor:
-        """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2), by Newton's method.
+        """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2).
 
-        Units as of `project`; float64, on the CPU. NaN where no direction is found. Of `equirectangular` by the formula.
+        By Newton's method, but for `equirectangular`, which has a formula.
+
+        Units as of `project`; float64, on the CPU. NaN where no direction is found.
 
         Raises:
             TypeError, ValueError: Positions as the points of `project`.
