@@ -18,6 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
+from ..lens import SPHERE
 from ..losses import counted, l1_ssim
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
@@ -214,6 +215,8 @@ class Trainer:
         """Whether the loss of a step is that of one picture of all Gaussians, and nothing else."""
         options = self.options
         one = self.ranks.world == 1 and options.pictures_per_step == 1
+        # Which is rendered from the stages.
+        one = one and not any(view.lens is not None and view.lens.model == SPHERE for view in self.pictures.views)
         return one and options.supersampling == 1 and not options.filter_3d and not any(options.regularizers)
 
     def _set_rates(self) -> None:
