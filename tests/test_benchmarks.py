@@ -769,6 +769,6 @@ def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["lens_training.py", *map(str, given), *options])
     program.main()
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert list(results) == ["pinhole, exact", "opencv, exact", "opencv, undistort", "fisheye, exact"]
+    assert list(results) == ["pinhole, keep", "opencv, keep", "opencv, undistort", "fisheye, keep"]
     assert all(math.isfinite(value) for values in results.values() for value in values)
-    assert "| fisheye, exact |" in capsys.readouterr().out
+    assert "| fisheye, keep |" in capsys.readouterr().out

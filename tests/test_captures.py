@@ -955,8 +955,8 @@ def test_lenses_can_be_refused(tmp_path):
     write(tmp_path, "SIMPLE_RADIAL", [-0.1])
     with pytest.raises(io.SceneError, match=r"9 of 9 photographs have a lens, .*\(perspective\)"):
         training.load_capture(tmp_path, lens="refuse")
-    with pytest.raises(ValueError, match="lens must be one of exact, undistort, refuse, got keep"):
-        training.load_capture(tmp_path, lens="keep")
+    with pytest.raises(ValueError, match="lens must be one of keep, undistort, refuse, got exact"):
+        training.load_capture(tmp_path, lens="exact")
 
 
 def test_a_lens_that_cannot_be_undistorted(tmp_path):
@@ -1060,13 +1060,13 @@ def test_a_checkpoint_without_an_offset_stays_in_the_world(tmp_path):
     assert train(tmp_path / "far", tmp_path / "out", "--iterations", "2") == 0
     path = tmp_path / "out" / files.CHECKPOINT
     state = torch.load(path, weights_only=True)
-    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "exact"
+    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "keep"
     assert state["source"].pop("cameras") is None
     torch.save(state, path)
     assert train(tmp_path / "far", tmp_path / "out", "--resume") == 0
     resumed = training.Run(tmp_path / "far", tmp_path / "out", resume=True)
-    assert resumed.source["offset"] is None and resumed.source["lens"] == "exact"
-    with pytest.raises(ValueError, match="lens must be exact or None where a training is resumed, got refuse"):
+    assert resumed.source["offset"] is None and resumed.source["lens"] == "keep"
+    with pytest.raises(ValueError, match="lens must be keep or None where a training is resumed, got refuse"):
         training.Run(tmp_path / "far", tmp_path / "out", resume=True, lens="refuse")
 
 
@@ -1074,12 +1074,12 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     """Each in a line, by the training and by the test."""
     write(tmp_path / "scene", "SIMPLE_RADIAL", [-0.1])
     (tmp_path / "scene" / "sparse" / "0" / "points3D.bin").unlink()
-    assert train(tmp_path / "scene", tmp_path / "exact", "--iterations", "1", "--random-points", "50") == 0
+    assert train(tmp_path / "scene", tmp_path / "kept", "--iterations", "1", "--random-points", "50") == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
     assert len(said) == 2 and re.search(EXACT % "perspective", said[0])
-    assert all(view.lens is not None for view in io.load_views(tmp_path / "exact" / "cameras.json"))
-    assert cli.main(["evaluate", str(tmp_path / "exact"), "--lpips", "none", "--pictures", "0"]) == 0
-    assert json.loads((tmp_path / "exact" / "evaluation.json").read_text())["resampled"] == 0
+    assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
+    assert cli.main(["evaluate", str(tmp_path / "kept"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert json.loads((tmp_path / "kept" / "evaluation.json").read_text())["resampled"] == 0
     assert re.search(EXACT % "perspective", capsys.readouterr().err)
     options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
     assert train(tmp_path / "scene", tmp_path / "out", *options) == 0

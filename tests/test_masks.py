@@ -59,7 +59,7 @@ def run_of(folder, out, *, lens=None, **options):
         ({"scales": (1, 2, 4)}, None, None),
         ({"scales": (2,), "downsampling": "bicubic"}, None, None),
         ({"density": "mcmc"}, None, None),
-        ({}, "exact", [-0.1]),
+        ({}, "keep", [-0.1]),
         ({"scales": (1, 2)}, "undistort", [-0.1]),
     ],
     ids=str,

@@ -20,7 +20,7 @@ __all__ = ["BLACK", "WHITE", "Capture", "Photograph", "load_capture"]
 IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
 CHOICES = {
-    "lens": ("exact", "undistort", "refuse"),
+    "lens": ("keep", "undistort", "refuse"),
     "missing": ("refuse", "skip"),
     "masks": ("auto", "none"),
     "alpha": ("background", "mask"),
@@ -35,7 +35,7 @@ def load_capture(
     test_every: int = TEST_PERIOD,
     *,
     cameras: str | None = None,
-    lens: str = "exact",
+    lens: str = "keep",
     missing: str = "refuse",
     masks: str = "auto",
     alpha: str = "background",
@@ -54,7 +54,7 @@ def load_capture(
             among them; 0 for none.
         cameras: The file or folder in `folder` to read the cameras from, such as "transforms.json" or "sparse/1"; None:
             chosen as above.
-        lens: "exact": the renderer has the lenses of the photographs; "undistort": photographs of cameras with a lens
+        lens: "keep": the renderer has the lenses of the photographs; "undistort": photographs of cameras with a lens
             are resampled to pinholes; "refuse": they are an error.
         missing: "refuse": pictures that are not there are an error; "skip": their cameras are left out.
         masks: "auto": black pixels of masks do not count, neither in training nor in tests. Masks are pictures in
