@@ -123,6 +123,9 @@ def cuda_on_cpu() -> Iterator[None]:
     torch.Generator(device="cuda"); streams and graphs; TorchScript; extensions that have CUDA kernels only. Code that
     a module runs when it is imported needs the context around the import.
     """
+    # torch.compile keeps a table of torch's functions, and torch.optim imports it: made now, it has the true ones.
+    import torch._dynamo
+
     with contextlib.ExitStack() as stack:
         for (owner, name), replacement in _replacements().items():
             stack.enter_context(mock.patch.object(owner, name, replacement))

@@ -111,7 +111,9 @@ def test_a_wheel_for_another_torch_says_so_in_one_sentence_at_import(tmp_path):
     done = run_program(program, environment=os.environ | {"PYTHONPATH": str(tmp_path)})
     assert done.returncode == 0 and done.stdout.strip() == str(package / "__init__.py")
     (warning,) = [line for line in done.stderr.splitlines() if "UserWarning" in line]
-    expected = f"was built for torch {torch.__version__.replace('2.', '9.', 1)}, and torch {torch.__version__} is installed"
+    expected = (
+        f"was built for torch {torch.__version__.replace('2.', '9.', 1)}, and torch {torch.__version__} is installed"
+    )
     assert expected in warning and f"install the wheel of {HERE}" in warning
 
 

@@ -128,6 +128,27 @@ def test_everything_is_as_before():
             torch.zeros(2, device="cuda")
 
 
+def test_optimisers_of_a_new_process():
+    """They import torch.compile, which makes a table of torch's functions: it must not have those of the context."""
+    done = run_program(
+        """
+        import torch
+        from analytic_rasterizer import testing
+        true = torch.cuda.synchronize
+        with testing.cuda_on_cpu():
+            p = torch.nn.Parameter(torch.ones(3, device="cuda"))
+            optimizer = torch.optim.Adam([p], lr=0.5)
+            p.sum().backward()
+            optimizer.step()
+            changed = torch.cuda.synchronize
+        known = torch._dynamo.trace_rules.get_torch_obj_rule_map()
+        print(true in known, changed in known, p.device.type, p.max().item() < 1)
+        """,
+        environment=os.environ | {"PYTHONPATH": python_path()},
+    )
+    assert done.stdout == "True False cpu True\n", done.stderr[-2000:]
+
+
 def test_pictures_and_gradients_are_those_of_the_cpu():
     """The rasterizer in a program that asks for CUDA everywhere, against the same program that does not."""
 
