@@ -12,7 +12,7 @@ from processes import DEADLINE, run_program
 import analytic_rasterizer as ar
 from analytic_rasterizer import testing
 
-pytest_plugins = ["analytic_rasterizer.pytest_fixtures"]
+pytest_plugins = ["analytic_rasterizer.testing.fixtures"]
 
 ONES = torch.ones(2, 3)
 CUDA = torch.device("cuda:0")

@@ -2,7 +2,7 @@
 
 import pytest
 
-pytest_plugins = ["analytic_rasterizer.pytest_fixtures"]
+pytest_plugins = ["analytic_rasterizer.testing.fixtures"]
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,6 @@
 """Tests on machines without a GPU, of programs that ask for CUDA by name.
 
-`cuda_on_cpu` is a context manager, and a pytest fixture in `analytic_rasterizer.pytest_fixtures`. What it covers, and
+`cuda_on_cpu` is a context manager, and a pytest fixture in `analytic_rasterizer.testing.fixtures`. What it covers, and
 what a program has to change itself: docs/ci.md.
 """
 
