@@ -47,13 +47,14 @@ def about(version: str, built_for: str, has_cuda: bool) -> str:
     """
     cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "no CUDA"
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU is visible"
+    fitting = wheel_folder(torch.__version__, torch.version.cuda)
     return "\n".join(
         (
             f"analytic_rasterizer {version}, built for torch {built_for.removeprefix(_BUILT_FOR)}, "
             f"for {'the CPU and CUDA' if has_cuda else 'the CPU'}",
             f"torch {torch.__version__} with {cuda}, Python {platform.python_version()}, {device}",
             "the wheels that fit this torch, where INDEX is the folder or the address of the wheels:",
-            f"    pip install --index-url INDEX/{wheel_folder(torch.__version__, torch.version.cuda)} analytic-rasterizer",
+            f"    pip install --index-url INDEX/{fitting} analytic-rasterizer",
         )
     )
 

@@ -7,6 +7,7 @@ what a program has to change itself: docs/ci.md.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -124,8 +125,7 @@ def cuda_on_cpu() -> Iterator[None]:
     a module runs when it is imported needs the context around the import.
     """
     # torch.compile keeps a table of torch's functions, and torch.optim imports it: made now, it has the true ones.
-    import torch._dynamo
-
+    importlib.import_module("torch._dynamo")
     with contextlib.ExitStack() as stack:
         for (owner, name), replacement in _replacements().items():
             stack.enter_context(mock.patch.object(owner, name, replacement))
