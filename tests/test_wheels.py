@@ -128,6 +128,7 @@ def test_a_folder_without_pairs_is_refused(tmp_path):
         ({"GLIBC_2.27", "GLIBC_2.29", "GLIBC_2.3.4"}, (29, "GLIBC_2.29")),
         ({"GLIBC_2.28", "GLIBCXX_3.4.24"}, (28, "GLIBC_2.28")),
         ({"GLIBC_2.32", "GLIBCXX_3.4.30"}, (35, "GLIBCXX_3.4.30")),
+        ({"GLIBC_2.32", "GLIBC_ABI_DT_RELR", "GLIBC_2.4"}, (36, "GLIBC_ABI_DT_RELR")),
     ],
 )
 def test_the_least_glibc(versions, expected):

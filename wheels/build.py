@@ -6,8 +6,9 @@ makes OUT/*.tar.gz, the sources, and from them OUT/pt213cpu/analytic-rasterizer/
 torch and CUDA), with the pages of the index. It then installs the wheel from the index into a fresh environment that
 sees the packages of this one, renders a picture there, and runs the given tests, such as tests/test_api.py.
 
-Needs torch, setuptools, ninja, pybind11 and wheel, for tests pytest, and no network. The environment variables of
-docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS.
+Needs torch, pip, setuptools, ninja, pybind11 and wheel, for tests pytest, and no network. The environment variables of
+docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: GPUs of this machine
+do not decide its architectures.
 """
 
 import importlib.util
@@ -49,7 +50,7 @@ def build(out: Path) -> Path:
         # From the sources and not from here: an old build folder would add its files.
         wheels = Path(folder) / "wheels"
         pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-        run(*pip, "--wheel-dir", wheels, sources)
+        run(*pip, "--wheel-dir", wheels, sources, env=os.environ | {"CUDA_VISIBLE_DEVICES": ""})
         (wheel,) = wheels.glob("*.whl")
         tag, because, needed = platform_tag(wheel)
         print(f"{tag}, because of {because}")
@@ -64,7 +65,7 @@ def build(out: Path) -> Path:
 def try_out(wheel: Path, tests: list[str]) -> None:
     """In a fresh environment, which gets torch and what the tests need from this one."""
     with tempfile.TemporaryDirectory() as folder:
-        run(sys.executable, "-m", "venv", f"{folder}/venv")
+        run(sys.executable, "-m", "venv", "--without-pip", f"{folder}/venv")
         python = Path(folder) / "venv" / "bin" / "python"
         own = subprocess.check_output(
             [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], text=True
@@ -72,10 +73,10 @@ def try_out(wheel: Path, tests: list[str]) -> None:
         (Path(own.strip()) / "torch.pth").write_text(sysconfig.get_path("purelib") + "\n")
         index = wheel.parent.parent.resolve().as_uri()
         # Whatever version of the package this environment has: torch and NumPy are there.
-        install = [python, "-m", "pip", "install", "--quiet", "--ignore-installed", "--no-deps", "--no-cache-dir"]
+        install = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-cache-dir"]
         environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PIP_FIND_LINKS")}
         environment["PIP_CONFIG_FILE"] = os.devnull
-        run(*install, "--index-url", index, PROJECT, env=environment)
+        run(*install, "--ignore-installed", "--no-deps", "--index-url", index, PROJECT, env=environment)
         for name in ("tests", "examples", "pyproject.toml"):  # without the package, which Python would find first
             copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
             copy(ROOT / name, Path(folder) / name)

@@ -37,7 +37,9 @@ def least_glibc(versions: set[str]) -> tuple[int, str]:
     """
     least = (17, "manylinux2014")
     for version in sorted(versions):
-        if match := re.fullmatch(r"GLIBC_2\.(\d+)(\.\d+)?", version):
+        if version == "GLIBC_ABI_DT_RELR":
+            least = max(least, (36, version))
+        elif match := re.fullmatch(r"GLIBC_2\.(\d+)(\.\d+)?", version):
             least = max(least, (int(match[1]), version))
         elif match := re.fullmatch(r"GLIBCXX_3\.4\.(\d+)", version):
             found = next((m for n, m in GLIBC_WITH_GLIBCXX if int(match[1]) <= n), None)
