@@ -7,8 +7,8 @@ torch and CUDA), with the pages of the index. It then installs the wheel from th
 sees the packages of this one, renders a picture there, and runs the given tests, such as tests/test_api.py.
 
 Needs torch, pip, setuptools, ninja, pybind11 and wheel, for tests pytest, and no network. The environment variables of
-docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: GPUs of this machine
-do not decide its architectures.
+docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: the GPUs of this
+machine do not decide its architectures.
 """
 
 import importlib.util
