@@ -11,7 +11,8 @@ import torch
 from . import _C
 from .autocast import widened
 from .checks import check_tensors
-from .effects import Effects
+from .effects import AUTO, Effects
+from .lens import Lens
 from .rotations import product
 from .settings import GaussianRasterizationSettings, one_number, whole_number
 
@@ -34,9 +35,10 @@ def camera_settings(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
     effects: Effects | str | None = None,
+    lens: Lens | None = None,
     **options,
 ) -> GaussianRasterizationSettings:
-    """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
+    """Settings of a camera: a pinhole, one with a lens, or with `Effects(orthographic=True)` an orthographic one.
 
     Gradients flow to every tensor that is given and requires one. The matrices are computed in float64 and rounded
     once.
@@ -51,11 +53,12 @@ def camera_settings(
         sh_degree, scale_modifier, debug: As in the settings.
         dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
         effects, **options: As in the settings, the footprint among them.
+        lens: Becomes that of the effects, which have no other; None: a pinhole, or that of the effects.
 
     Raises:
-        TypeError: world_to_camera or bg is no tensor, or one of the numbers is none.
-        ValueError: world_to_camera has a wrong shape, a focal length that is a number is not positive and finite, a
-            principal point that is one is not finite, or width or height is not a whole number.
+        TypeError: world_to_camera or bg is no tensor, or one of the numbers is none, or the lens.
+        ValueError: Effects with another lens; world_to_camera has a wrong shape, a focal length that is a number is not
+            positive and finite, a principal point that is one is not finite, or width or height is not a whole number.
     """
     width, height = whole_number("width", width), whole_number("height", height)
     check_tensors(None, world_to_camera=world_to_camera, **({} if bg is None else {"bg": bg}))
@@ -70,6 +73,8 @@ def camera_settings(
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         elif value is not None and not math.isfinite(one_number(name, value)):
             raise ValueError(f"{name} must be finite, got {value}")
+    if lens is not None:
+        effects = _with_lens(effects, lens)
     view = world_to_camera.double()
     fx, fy, cx, cy = (
         torch.as_tensor(v, dtype=torch.float64, device=view.device).reshape(())
@@ -103,6 +108,17 @@ def camera_settings(
         effects=effects,
         **options,
     )
+
+
+def _with_lens(effects: Effects | str | None, lens: Lens) -> Effects | str:
+    """The effects of a camera with a lens. Harmonics of "auto" are used in full then."""
+    if effects is None or effects == AUTO:
+        return Effects(lens=lens)
+    if not isinstance(effects, Effects):
+        return effects  # which the settings refuse
+    if effects.lens is not None and effects.lens != lens:
+        raise ValueError(f"effects.lens must be None where the camera has a lens, got {effects.lens}")
+    return replace(effects, lens=lens)
 
 
 def camera_matrices(
@@ -239,7 +255,7 @@ def is_off_center(settings) -> bool:
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera with the size of its picture.
+    """A camera with the size of its picture.
 
     Attributes:
         name: Of the picture, without directory and suffix.
@@ -248,6 +264,7 @@ class View:
         w2c: (4, 4) float64, world to camera; x right, y down, z forward (OpenCV).
         cx, cy: Principal point, px, the picture spanning [0, width] x [0, height]; None: its centre.
         offset: (x, y, z), world units: positions in the world are those of w2c plus this. None: they are the same.
+        lens: How its picture differs from that of a pinhole; None: not at all.
     """
 
     name: str
@@ -259,6 +276,7 @@ class View:
     cx: float | None = None
     cy: float | None = None
     offset: tuple[float, float, float] | None = None
+    lens: Lens | None = None
 
     def __post_init__(self):
         for field in fields(self):
@@ -277,6 +295,28 @@ class View:
 
     def _other_fields(self) -> tuple:
         return tuple(getattr(self, field.name) for field in fields(self) if field.name != "w2c")
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """(cx, cy), px."""
+        return self.width / 2 if self.cx is None else self.cx, self.height / 2 if self.cy is None else self.cy
+
+    def pixels_of(self, points: torch.Tensor) -> torch.Tensor:
+        """(N, 2) where points (N, 3) in the camera's frame are in the picture, px, float64; NaN where nowhere."""
+        points = points.double()
+        if self.lens is None:
+            positions = torch.where(points[:, 2:] > 0, points[:, :2] / points[:, 2:], math.nan)
+        else:
+            positions = self.lens.project(points)[0].to(points.device)
+        return positions * points.new_tensor([self.fx, self.fy]) + points.new_tensor(self.middle)
+
+    def rays_of(self, pixels: torch.Tensor) -> torch.Tensor:
+        """(N, 3) unit vectors in the camera's frame that pixels (N, 2) show, float64; NaN for pixels that show none."""
+        pixels = pixels.double()
+        positions = (pixels - pixels.new_tensor(self.middle)) / pixels.new_tensor([self.fx, self.fy])
+        if self.lens is None:
+            return torch.nn.functional.normalize(torch.cat([positions, torch.ones_like(positions[:, :1])], 1), dim=1)
+        return self.lens.unproject(positions).to(pixels.device)
 
     def in_frame(self, offset: tuple[float, float, float] | None) -> View:
         """The same camera with positions relative to another offset, as those of a scene with this offset are."""
@@ -317,8 +357,7 @@ class View:
         """
         size = [max(1, length // scale) for length in (self.width, self.height)]
         width, height = size if crop is None else map(min, size, crop)
-        centre = (self.width / 2 if self.cx is None else self.cx, self.height / 2 if self.cy is None else self.cy)
-        cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(centre, size, (width, height)))
+        cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(self.middle, size, (width, height)))
         return replace(self, width=width, height=height, fx=self.fx / scale, fy=self.fy / scale, cx=cx, cy=cy)
 
     def settings(
@@ -336,7 +375,7 @@ class View:
         Args:
             scale: Of the picture.
             background: (r, g, b) in [0, 1].
-            sh_degree, footprint, options: As in `GaussianRasterizationSettings`; no footprint: the default.
+            sh_degree, footprint, options: As in `camera_settings`; no footprint: the default.
             device: Of the tensors of the settings.
 
         Raises:
@@ -355,5 +394,6 @@ class View:
             sh_degree=sh_degree,
             footprint=footprint,
             device=device,
+            lens=view.lens,
             **options,
         )

@@ -169,7 +169,7 @@ class Effects:
             `camera_settings` derives them from a pose and fx, fy, cx, cy.
         orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
             units, and projmatrix must leave w at 1.
-        off_center: Centre the clamp of x/z and y/z in the projection of covariances on the principal point of
+        off_center: Centre the clamp of x/z and y/z in the projection of covariances on the middle of the picture, by
             projmatrix. Without it the clamp is that of 3DGS, around the optical axis: right unless an edge of the
             picture is more than 1.3 half pictures away from the axis, as in a crop.
         near: Camera-space z up to which everything is culled, world units.

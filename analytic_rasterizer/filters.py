@@ -15,9 +15,11 @@ from typing import Any
 import torch
 
 from .autocast import way_out_of, widened
+from .camera import view_center
 from .checks import check_tensors
 from .effects import Effects
 from .footprints import DILATED, resolve_footprint
+from .lens import WIDE
 from .outputs import depths
 from .rotations import rotation_matrices
 from .settings import GaussianRasterizationSettings
@@ -93,7 +95,7 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     """
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
     if effects.lens is not None:
-        raise ValueError(f"the sampling interval of cameras with a lens is not known, got a {effects.lens.model} lens")
+        return _interval_of_lens(means3D, camera, effects)
     clip = camera.projmatrix.reshape(4, 4).to(means3D)
     z = depths(means3D, camera.viewmatrix.to(means3D))
     columns = means3D.split(1, dim=1)  # not `@`, which autocast and TF32 round
@@ -107,6 +109,29 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     focal = torch.maximum(in_x, in_y)
     inside &= (z > effects.near) & (z < effects.far)
     return torch.where(inside, (torch.ones_like(z) if effects.orthographic else z) / focal, torch.inf)
+
+
+def _interval_of_lens(means3D: torch.Tensor, camera: Any, effects: Effects) -> torch.Tensor:
+    """The same for a camera with a lens, computed in float64 on the CPU.
+
+    It is the inverse of the Jacobian's smaller singular value: the interval in the direction in which samples are
+    farthest apart, as z / focal length is for a pinhole.
+    """
+    view = camera.viewmatrix.detach().reshape(4, 4).to("cpu", torch.float64)
+    points = widened(means3D.detach()).to("cpu", torch.float64)
+    points = points @ view[:3, :3] + view[3, :3]
+    positions, derivatives = effects.lens.project(points)
+    middle = view_center(camera.viewmatrix, camera.projmatrix, with_gradient=False).to(positions)
+    tangents = positions.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
+    inside = ((positions - middle).abs() <= (1 + 2 * MARGIN) * tangents).all(1)
+    depth = points.norm(dim=1) if effects.lens.model in WIDE else points[:, 2]
+    inside &= (depth > effects.near) & (depth < effects.far)
+    focal = max(camera.image_width / (2 * float(camera.tanfovx)), camera.image_height / (2 * float(camera.tanfovy)))
+    rows = derivatives @ view[:3, :3].T
+    xx, yy, xy = rows[:, 0].square().sum(1), rows[:, 1].square().sum(1), (rows[:, 0] * rows[:, 1]).sum(1)
+    larger = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)  # the larger eigenvalue of the rows' products
+    smaller = (xx * yy - xy * xy).clamp_min(0) / larger
+    return torch.where(inside, torch.rsqrt(smaller) / focal, torch.inf).to(means3D)
 
 
 def apply_3d_filter(

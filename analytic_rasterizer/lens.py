@@ -22,6 +22,7 @@ _PARTS = {
 MODELS = (*_PARTS, "fov")
 WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis
 _DIRECTIONS, _ANGLES = 64, 512  # of the rays with which limits are found
+_NEWTON_STEPS, _LONGEST_STEP = 30, 0.2  # rad
 _WIDEST_PERSPECTIVE = math.radians(89.5)
 
 
@@ -115,6 +116,56 @@ class Lens:
         """
         return cls("fov", (w,))
 
+    def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where the lens shows points, in units of the focal lengths, from the principal point. Waits for a device.
+
+        Args:
+            points: (N, 3) in the camera's frame: x right, y down, z forward.
+
+        Returns:
+            positions: (N, 2) float64 on the CPU; NaN beyond `fold`, where the lens shows nothing.
+            derivatives: (N, 2, 3) of the positions by the points, likewise.
+
+        Raises:
+            TypeError: The points are no tensor.
+            ValueError: They do not have the shape (N, 3).
+        """
+        points = _rows("points", points, 3)
+        positions, derivatives = _C.lens_points(self.model, list(self.numbers()), points)
+        hidden = torch.atan2(points[:, :2].norm(dim=1), points[:, 2]) > self.fold
+        if hidden.any():
+            positions[hidden], derivatives[hidden] = math.nan, math.nan
+        return positions, derivatives
+
+    def unproject(self, positions: torch.Tensor) -> torch.Tensor:
+        """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2), by Newton's method.
+
+        Units as of `project`; float64, on the CPU. NaN where no direction is found.
+
+        Raises:
+            TypeError, ValueError: Positions as the points of `project`.
+        """
+        positions = _rows("positions", positions, 2)
+        # The unknown is the angle from the axis times the unit vector across it. `start` has the angle that the lens
+        # shows at this distance along x.
+        angles = torch.linspace(0, self.fold, 8 * _ANGLES, dtype=torch.float64)
+        shown = self.project(torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], 1))[0]
+        shown = shown.norm(dim=1).nan_to_num(math.inf).cummax(0).values
+        distance = positions.norm(dim=1)
+        found = angles[torch.searchsorted(shown, distance).clamp_max(len(angles) - 1)]
+        turned = positions * (found / distance.clamp_min(1e-300))[:, None]
+        values = list(self.numbers())
+        for _ in range(_NEWTON_STEPS):
+            rays, slopes = _turned_rays(turned)
+            seen, derivatives = _C.lens_points(self.model, values, rays)
+            step = torch.linalg.solve_ex(derivatives @ slopes, (positions - seen)[:, :, None])[0][:, :, 0]
+            # Not past the axis, nor farther than the lens bends in a step.
+            turned = turned + step * (_LONGEST_STEP / step.norm(dim=1, keepdim=True)).clamp_max(1)
+        rays, _ = _turned_rays(turned)
+        seen = self.project(rays)[0]
+        wrong = ~((seen - positions).norm(dim=1) <= 1e-9 * (1 + distance))
+        return torch.where(wrong[:, None], math.nan, rays)
+
     def with_reach(self, tangents: Sequence[float], center: Sequence[float]) -> Lens:
         """The same with `reach` for a picture, unless it has one.
 
@@ -125,13 +176,13 @@ class Lens:
         if self.reach is not None:
             return self
         numbers = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
-        reach = _reach(self.model, self._values(), *numbers)
+        reach = _reach(self.model, self.numbers(), *numbers)
         return Lens(self.model, self.coefficients, reach)
 
     @property
     def fold(self) -> float:
         """The angle from the axis at which the map folds back, rad, or where the model ends. Reads the coefficients."""
-        return _fold(self.model, self._values())
+        return _fold(self.model, self.numbers())
 
     def members(self) -> dict:
         """The entries of the operator's argument `lens`, by the names of `_C.LENS`."""
@@ -143,18 +194,41 @@ class Lens:
             "fold": measure(self.fold),
         }
 
-    def _values(self) -> tuple[float, ...]:
+    def numbers(self) -> tuple[float, ...]:
+        """The twelve coefficients. Waits for the device of a tensor."""
         given = self.coefficients
         return tuple(given.detach().double().tolist()) if isinstance(given, torch.Tensor) else given
 
     def __eq__(self, other: object):
         if not isinstance(other, Lens):
             return NotImplemented
-        same = self.coefficients is other.coefficients or self._values() == other._values()
+        same = self.coefficients is other.coefficients or self.numbers() == other.numbers()
         return same and (self.model, self.reach) == (other.model, other.reach)
 
     def __hash__(self):
         return hash((self.model, self.reach))  # tensors that are equal have different hashes
+
+
+def _rows(name: str, given: torch.Tensor, width: int) -> torch.Tensor:
+    if not isinstance(given, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(given).__name__}")
+    if given.dim() != 2 or given.shape[1] != width:
+        raise ValueError(f"{name} must have shape (N, {width}), got {tuple(given.shape)}")
+    return given.detach().to("cpu", torch.float64).contiguous()
+
+
+def _turned_rays(turned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit vectors (N, 3) at the angle |turned| (N, 2) from the axis, and their derivatives (N, 3, 2)."""
+    angle = turned.norm(dim=1)
+    sinc = torch.sinc(angle / math.pi)
+    # d sinc(a) / da / a, whose series is used near the axis.
+    small = angle < 1e-4
+    safe = torch.where(small, 1.0, angle)
+    slope = torch.where(small, -1 / 3, (safe.cos() - sinc) / safe**2)
+    x, y = turned.unbind(1)
+    rays = torch.stack([sinc * x, sinc * y, angle.cos()], 1)
+    rows = [[sinc + slope * x * x, slope * x * y], [slope * x * y, sinc + slope * y * y], [-sinc * x, -sinc * y]]
+    return rays, torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
 def _numbers(name: str, given, most: int) -> tuple[float, ...]:

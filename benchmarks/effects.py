@@ -30,6 +30,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import Case, fixed_weights
+from analytic_rasterizer.camera import view_center
 from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.outputs import depths
@@ -185,6 +186,18 @@ class EffectCase(Case):
         return self.change({"sh_degree": degree}, {"shs": self.scene.with_sh_degree(4).shs})
 
 
+def lens(of: ar.Lens):
+    """A change to the same camera with a lens."""
+
+    def change(case: EffectCase) -> EffectCase:
+        settings = case.settings
+        middle = view_center(settings.viewmatrix, settings.projmatrix, with_gradient=False)
+        found = of.with_reach((settings.tanfovx, settings.tanfovy), middle)  # once, as `camera_settings` does
+        return case.change({"effects": ar.Effects(lens=found)})
+
+    return change
+
+
 def effect(**fields) -> Callable[[EffectCase], EffectCase]:
     return lambda case: case.with_effects(**fields)
 
@@ -206,6 +219,8 @@ ROWS = {
     "camera_gradients": (EffectCase.plain, EffectCase.camera_gradients),
     "orthographic": (EffectCase.plain, EffectCase.orthographic),
     "off_center": (EffectCase.plain, effect(off_center=True)),
+    "lens:perspective": (EffectCase.plain, lens(ar.Lens.perspective((-0.1, 0.02), (1e-3, 1e-3)))),
+    "lens:fisheye": (EffectCase.plain, lens(ar.Lens.fisheye((0.02,)))),
     "near_far": (EffectCase.plain, EffectCase.near_far),
     "filter_3d": (EffectCase.plain, EffectCase.filter_3d),
     "defocus": (EffectCase.plain, EffectCase.defocus),

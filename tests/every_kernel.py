@@ -108,7 +108,7 @@ def footprint(device: str, images: Sequence[str] = FEW_IMAGES, **settings) -> No
 def many_channels(device: str) -> None:
     for count in (1, 5, 32, 70):
         for name in ("box:samples=4", "box:samples=16", "analytic"):
-            render(device, channels=count, footprint=name)
+            render(device, channels=count, images=FEW_IMAGES, footprint=name)
 
 
 def sorts(device: str) -> None:

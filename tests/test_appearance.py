@@ -53,8 +53,20 @@ def options_json(footprint, scales=(1,), background=None, **described):
     )
 
 
+FILTERED = {"filter_3D": 0.02}  # a scene as Mip-Splatting and Analytic-Splatting write it
+
+
+def add_column(path, name, value):
+    """Another float32 in every row of a .ply that `save_scene` wrote."""
+    header, end, rows = path.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(rows, np.uint8).reshape(make_scene().count, -1)
+    column = np.full((len(rows), 1), value, np.float32).view(np.uint8)
+    path.write_bytes(header + f"property float {name}\n".encode() + end + np.hstack([rows, column]).tobytes())
+
+
 def write(folder, contents):
-    """Files by their paths. A scene is `None`, or what `SceneMetadata` says; views are a size; other files are text."""
+    """Files by their paths. A scene is `None`, what `SceneMetadata` says, or FILTERED; views are a size; other files
+    are text."""
     for name, content in contents.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,6 +74,9 @@ def write(folder, contents):
             io.save_views(path, make_views(*content))
         elif isinstance(content, str):
             path.write_text(content)
+        elif content is FILTERED:
+            io.save_scene(path, make_scene())
+            add_column(path, "filter_3D", 0.02)
         else:
             io.save_scene(path, make_scene(), io.SceneMetadata(**(content or {})))
 
@@ -130,11 +145,35 @@ CHOICES = {
     "without dilation": ({"a.ply": None}, "a.ply", None, "point:dilation=0", "point:dilation=0.0", "too thin"),
     "a name with spaces": ({"a b.ply": None}, "a b.ply", None, None, UNMARKED, "a b.ply' --out FILE"),
     "a model": ({DEEP: None}, "MODEL", None, None, UNMARKED, "point_cloud.ply names none"),
+    "a model of Mip-Splatting": (
+        {DEEP: FILTERED, "MODEL/cfg_args": "Namespace(kernel_size=0.1)"},
+        "MODEL", None, None, MIP, "cfg_args says kernel_size 0.1, the variance of Mip-Splatting's filter",
+    ),
+    "its fused file": (
+        {"fused.ply": None, "cfg_args": "Namespace(kernel_size=0.3)"},
+        "fused.ply", None, None, "mip:variance=0.3", "cfg_args says kernel_size 0.3",
+    ),
+    "one of its kin": (
+        {"a.ply": FILTERED, "cfg_args": "Namespace(kernel_size=0.0)"},
+        "a.ply", None, None, "mip:variance=0.0", "cfg_args says kernel_size 0,",
+    ),
+    "its file alone": ({"a.ply": FILTERED}, "a.ply", None, None, MIP, "column filter_3D of Mip-Splatting"),
+    "Analytic-Splatting": (
+        {DEEP: FILTERED, "MODEL/cfg_args": "Namespace(load_allres=False)"},
+        "MODEL", None, None, MIP, "Analytic-Splatting writes it too, then give --footprint analytic",
+    ),
+    "a baked file beside kernel_size": (
+        {"a.ply": MOMENT, "cfg_args": "Namespace(kernel_size=0.1)"},
+        "a.ply", None, None, "moment:samples=4", "a.ply says so",
+    ),
+    "the width of a blur": (
+        {"a.ply": None, "cfg_args": "Namespace(kernel_size=9)"}, "a.ply", None, None, UNMARKED, "names none",
+    ),
     "a baked model": ({DEEP: MOMENT}, DEEP, None, None, "moment:samples=4", "point_cloud.ply says so"),
 }  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore:.*it is not what `train` writes")
+@pytest.mark.filterwarnings("ignore:.*it is not what `train` writes", "ignore:.*kernel_size is ignored, got 9")
 @pytest.mark.parametrize("case", CHOICES)
 def test_footprint_of_a_scene(tmp_path, monkeypatch, case):
     contents, scene, environment, given, footprint, reason = CHOICES[case]
@@ -333,7 +372,14 @@ def test_cfg_args_of_other_versions(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = read_cfg_args(tmp_path / "cfg_args")
-    assert found == CfgArgs(False, 1600.0, "images", "/a b/c", False)
+    assert found == CfgArgs(False, 1600.0, "images", "/a b/c", False, 0.1)
+
+
+@pytest.mark.parametrize("value", ["-0.1", "9", "1e999", "True", "'0.1'"])
+def test_a_kernel_size_that_is_no_variance_is_ignored(tmp_path, value):
+    (tmp_path / "cfg_args").write_text(f"Namespace(kernel_size={value})")
+    with pytest.warns(UserWarning, match=r"cfg_args: kernel_size is ignored, got "):
+        assert read_cfg_args(tmp_path / "cfg_args").kernel_size is None
 
 
 def test_cfg_args_that_is_no_file_is_ignored(tmp_path):
@@ -416,6 +462,25 @@ def test_a_baked_scene_is_shown_with_moment_and_not_baked_again(model, tmp_path,
     assert run(["bake", str(baked), *views, "--out", str(tmp_path / "twice.ply")]) == 2
     assert f"{name}: no dilation to bake" in capsys.readouterr().err
     assert run(["bake", str(baked), *views, "--footprint", "point", "--out", str(tmp_path / "twice.ply")]) == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*the column filter_3D, a 3D filter, is not applied")
+def test_a_scene_of_mip_splatting_is_shown_with_its_filter_and_not_baked(tmp_path, capsys):
+    write(tmp_path, {DEEP: FILTERED, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": "Namespace(kernel_size=0.2)"})
+    model = tmp_path / "MODEL"
+    assert run(["render", str(model), "--out", str(tmp_path / "out")]) == 0
+    reason = "cfg_args says kernel_size 0.2, the variance of Mip-Splatting's filter"
+    assert capsys.readouterr().err.endswith(f"footprint mip:variance=0.2: {reason}\n")
+    expected = shown(make_scene(), make_views()[0], "mip:variance=0.2", io.BLACK)
+    assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
+    assert run(["bake", str(model), "--out", str(tmp_path / "b.ply")]) == 2
+    assert f"no dilation to bake: it says that pixels are to be integrated (footprint mip:variance=0.2: {reason})" in (
+        capsys.readouterr().err
+    )
+    assert not (tmp_path / "b.ply").exists()
+    assert run(["inspect", str(model), "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["trained_with"], found["bake"]) == ("mip:variance=0.2", None)
 
 
 def test_bake_takes_the_dilation_of_the_training(model, tmp_path):

@@ -671,3 +671,43 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     assert most_in_tile["small"] > int(long_list) and longest["small"] > int(long_list)
     assert most_in_tile["large, few tiles"] > int(long_list) and short["large, few tiles"] > 100
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100
+
+
+def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
+    """Its formulas are those of the library, a photograph is the library's picture, and every training has a number."""
+    numpy = pytest.importorskip("numpy")
+    pytest.importorskip("PIL.Image", reason="needs the train extra")
+    program = importlib.import_module("lens_training")
+    a, b = numpy.meshgrid(numpy.linspace(-0.4, 0.4, 9), numpy.linspace(-0.3, 0.3, 7))
+    lenses = {
+        program.opencv_rays: ar.Lens.perspective(program.K, program.P),
+        program.fisheye_rays: ar.Lens.fisheye(program.FISHEYE),
+        program.pinhole_rays: None,
+    }
+    for inverse, lens in lenses.items():
+        seen = (lens or ar.Lens.perspective()).project(torch.from_numpy(inverse(a, b)).reshape(-1, 3))[0].numpy()
+        assert numpy.abs(seen - numpy.stack([a, b], -1).reshape(-1, 2)).max() < 1e-9
+    scene = importlib.import_module("scene_files").load_scene(str(small_scene / "scene.npz"))
+    # Not splats that fill the picture, whose affine picture is not that of rays.
+    scene.log_scales.clamp_(max=math.log(0.05))
+    renderer = program.Renderer(scene, "cpu", "box:samples=4", (0.0, 0.0, 0.0))
+    (view, _) = io.load_views(small_scene / "views.json")
+    for inverse, lens in lenses.items():
+        made = renderer.photograph(view, program.rays_of(view, inverse))
+        settings = dataclasses.replace(view, lens=lens).settings(sh_degree=1, footprint="box:samples=16")
+        image, _ = ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())
+        assert image.std() > 0.01
+        error = (made - image).square().mean().sqrt()
+        assert error < 0.1 * image.std(), (lens, error, image.std())
+    views = [dataclasses.replace(view, name=f"{k}", w2c=view.w2c.clone()) for k in range(10)]
+    for k, each in enumerate(views):
+        each.w2c[0, 3] += 0.1 * k
+    io.save_views(small_scene / "views.json", views)
+    given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--out", tmp_path / "out"]
+    options = ["--iterations", "2", "--points", "30", "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", ["lens_training.py", *map(str, given), *options])
+    program.main()
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert list(results) == ["pinhole, exact", "opencv, exact", "opencv, undistort", "fisheye, exact"]
+    assert all(math.isfinite(value) for values in results.values() for value in values)
+    assert "| fisheye, exact |" in capsys.readouterr().out

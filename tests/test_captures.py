@@ -13,6 +13,7 @@ import pytest
 import torch
 from conftest import SHARED
 
+import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, render_stages
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
@@ -32,7 +33,7 @@ from capture_files import (  # noqa: E402
 )
 
 from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import captures, colmap, files, lenses, pictures, placement, run  # noqa: E402
+from analytic_rasterizer.training import captures, colmap, files, pictures, placement, run, undistortion  # noqa: E402
 from analytic_rasterizer.training import model as g  # noqa: E402
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
@@ -52,7 +53,7 @@ def test_colmap_files(tmp_path, write, model):
     read = colmap.load_views(tmp_path / "0")
     assert [item.name for item in read] == ["a.png", "b c.png", "c.png"]
     for expected, item in zip(sorted(views, key=lambda v: v.name), read):
-        assert replace(item.view, w2c=None) == replace(expected, w2c=None) and item.lens is None
+        assert replace(item.view, w2c=None) == replace(expected, w2c=None)
         torch.testing.assert_close(item.view.w2c, expected.w2c)
     read_points, read_colors = colmap.load_points(tmp_path / "0")
     assert torch.equal(read_points, points.double())
@@ -147,7 +148,7 @@ def test_capture_is_read_as_it_was_taken(name, count, points):
     means, colors = capture.points
     assert len(capture.train) + len(capture.test) == count and len(means) == (points or len(means))
     item = capture.train[8]
-    view, rgba = pictures.fitted(pictures.read_picture(item.files[1]), item, 16)
+    view, rgba, _ = pictures.fitted(pictures.read_picture(item.files[1]), item, 16)
     assert rgba.shape == (view.height, view.width, 4) and view.height % 16 == view.width % 16 == 0
     stages = render_stages(view.settings(), **point_inputs(means))
     colors = colors[stages.ids.long()]
@@ -266,15 +267,23 @@ def test_nerfstudio_lists_of_other_things(tmp_path, lists, message):
     assert str(raised.value) == f"{tmp_path / 'transforms.json'}: {message}"
 
 
-def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
-    def add_masks(content):
+def test_masks_of_nerfstudio(tmp_path):
+    def add_masks(content, name="masks/r.png"):
         for frame in content["frames"][::3]:
-            frame["mask_path"] = "masks/r.png"
+            frame["mask_path"] = name
 
     write_nerfstudio(tmp_path, add_masks)
-    with pytest.warns(UserWarning, match="the masks of 3 pictures are ignored") as told:
-        assert len(training.load_capture(tmp_path).train) == 7
-    assert len(told) == 1 and told[0].filename == __file__
+    with pytest.raises(io.SceneError, match=r"frame 0: mask_path must name a picture beside the file, got .*r\.png"):
+        training.load_capture(tmp_path)
+    write_grey(tmp_path / "masks", circle(1, (35, 33)), ["r.png"])
+    found = training.load_capture(tmp_path)
+    assert found.notes == ("3 of 9 photographs have a mask, whose black pixels do not count",)
+    masked = [item.view.name for item in (*found.train, *found.test) if item.mask == tmp_path / "masks" / "r.png"]
+    assert sorted(masked) == ["r_0", "r_3", "r_6"]
+    assert training.load_capture(tmp_path, masks="none").notes == ()
+    write_nerfstudio(tmp_path / "other", lambda content: add_masks(content, 3))
+    with pytest.raises(io.SceneError, match="frame 0: mask_path must name a picture beside the file, got 3"):
+        training.load_capture(tmp_path / "other")
 
 
 @pytest.mark.parametrize(
@@ -282,22 +291,12 @@ def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
     [
         (
             lambda content: content["frames"][8].update(distortion_params=[0.0, 0.1]),
-            "frame 8: lenses must be those of OpenCV (k1, k2, k3, k4, p1, p2), got distortion_params = [0.0, 0.1];",
+            "frame 8: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got distortion_params = [0.0, "
+            "0.1];",
         ),
-        (
-            lambda content: content.update(is_fisheye=True),
-            "frame 0: lenses must be those of OpenCV (k1, k2, k3, k4, p1, p2), got is_fisheye = True;",
-        ),
-        (lambda content: content.update(k1=math.nan), "frame 0: k1 must be a finite number, got nan"),
-        (
-            lambda content: content.update(camera_model="OPENCV_FISHEYE"),
-            "camera_model must be that of a pinhole camera, got 'OPENCV_FISHEYE'; of lenses, training takes those of "
-            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV: undistort the pictures first",
-        ),
-        (
-            lambda content: content["frames"][2].update(camera_model="EQUIRECTANGULAR"),
-            "frame 2: camera_model must be that of a pinhole camera, got 'EQUIRECTANGULAR'; of lenses, training takes",
-        ),
+        (lambda content: content.update(k4=0.1), "frame 0: a lens of OPENCV must have no coefficients but"),
+        (lambda content: content.update(k1=math.nan), "frame 0: every number of radial must be finite, got nan"),
+        (lambda content: content.update(camera_model="FTHETA"), "frame 0: camera_model must be one of SIMPLE_PINHOLE,"),
     ],
 )
 def test_nerfstudio_cameras_with_other_lenses(tmp_path, capsys, change, message):
@@ -449,7 +448,7 @@ def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
 
 
 def fitted(path, view, multiple):
-    return pictures.fitted(pictures.read_picture(path), training.Photograph(view, {1: path}), multiple)
+    return pictures.fitted(pictures.read_picture(path), training.Photograph(view, {1: path}), multiple)[:2]
 
 
 def test_cut_pictures_see_the_same(tmp_path):
@@ -486,10 +485,10 @@ def test_pictures_that_were_turned_are_refused(tmp_path):
 def test_colors_of_reduced_pictures(downsampling):
     """They count by their alpha, but in the files of the multi-scale Blender set."""
     rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
-    plain = pictures.reduce(rgba, 1, captures.WHITE, downsampling)
+    plain = pictures.reduce(rgba, 1, captures.WHITE, downsampling)[0]
     assert plain[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
-    on_white = pictures.reduce(rgba, 2, captures.WHITE, downsampling)[:, 0, 0].tolist()
-    premultiplied = pictures.reduce(rgba, 2, None, downsampling)[:, 0, 0].tolist()
+    on_white = pictures.reduce(rgba, 2, captures.WHITE, downsampling)[0][:, 0, 0].tolist()
+    premultiplied = pictures.reduce(rgba, 2, None, downsampling)[0][:, 0, 0].tolist()
     if downsampling == "blender":
         assert on_white == [191, 191, 128] and premultiplied == [64, 64, 0, 128]  # 255 (0.5 * 0.5 + 0.5), 128
     else:
@@ -503,7 +502,7 @@ def test_reduced_pictures_of_one_color_keep_it(downsampling, scale):
     alpha = torch.randint(256, (16, 24), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.stack([*torch.full((3, 16, 24), 255, dtype=torch.uint8), alpha], 2)
     rgba[..., :3][alpha == 0] = 0  # as programs store what nobody sees
-    assert (pictures.reduce(rgba, scale, captures.WHITE, downsampling) == 255).all()
+    assert (pictures.reduce(rgba, scale, captures.WHITE, downsampling)[0] == 255).all()
 
 
 @pytest.mark.parametrize("scale", [2, 4])
@@ -512,7 +511,7 @@ def test_bicubic_reduction_is_that_of_pillow(scale):
     pixels = torch.randint(256, (16, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.cat([pixels, torch.full((16, 24, 1), 255, dtype=torch.uint8)], dim=2)
     expected = image.fromarray(pixels.numpy()).resize((24 // scale, 16 // scale), image.Resampling.BICUBIC)
-    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic").permute(1, 2, 0)
+    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic")[0].permute(1, 2, 0)
     assert (got.int() - torch.from_numpy(np.array(expected)).int()).abs().max() <= 1
 
 
@@ -640,6 +639,7 @@ def with_exif(folder, orientation, size=SIZE) -> None:
         picture.save(path, exif=exif)
 
 
+EXACT = r"9 of 9 photographs have a lens \(%s\), with which they are rendered"
 RESAMPLED = r"9 of 9 photographs \(%s\) are resampled to pinholes, for tests too, and lose \d+\.\d"
 IN_VIEW = {"starts_in_view": True, "points": None}
 
@@ -648,33 +648,34 @@ IN_VIEW = {"starts_in_view": True, "points": None}
 FOUND = {
     "pinholes": (write, {"notes": ()}),
     "one focal length": (lambda f: write(f, "SIMPLE_PINHOLE"), {"notes": ()}),
-    "simple radial": (lambda f: write(f, "SIMPLE_RADIAL", [-0.1]), {"notes": RESAMPLED % "SIMPLE_RADIAL"}),
-    "radial": (lambda f: write(f, "RADIAL", [0.1, -0.05]), {"notes": RESAMPLED % "RADIAL"}),
-    "opencv": (lambda f: write(f, "OPENCV", [0.05, -0.02, 1e-3, -1e-3]), {"notes": RESAMPLED % "OPENCV"}),
+    "simple radial": (lambda f: write(f, "SIMPLE_RADIAL", [-0.1]), {"notes": EXACT % "perspective"}),
+    "radial": (lambda f: write(f, "RADIAL", [0.1, -0.05]), {"notes": EXACT % "perspective"}),
+    "opencv": (lambda f: write(f, "OPENCV", [0.05, -0.02, 1e-3, -1e-3]), {"notes": EXACT % "perspective"}),
     "full opencv": (
         lambda f: write(f, "FULL_OPENCV", [0.1, 0, 1e-3, 0, 0.1, 0.2, 0, 0], write_colmap_text),
-        {"notes": RESAMPLED % "FULL_OPENCV"},
+        {"notes": EXACT % "perspective"},
     ),
     "opencv without distortion": (lambda f: write(f, "OPENCV"), {"notes": ()}),
-    "a camera per picture, of two sizes": (of_two_sizes, {"notes": RESAMPLED % "SIMPLE_RADIAL"}),
+    "a camera per picture, of two sizes": (of_two_sizes, {"notes": EXACT % "perspective"}),
     "wild distortion": (
         lambda f: write(f, "OPENCV", [0.3, -59, 0, 0]),
-        r"sparse/0/cameras: camera 1 \(OPENCV\): the distortion of OPENCV folds back inside the picture: \d+% of it",
+        {"notes": EXACT % "perspective"},
     ),
+    "a fisheye": (lambda f: write(f, "OPENCV_FISHEYE", [0.01, 0, 0, 0]), {"notes": EXACT % "fisheye"}),
     "not finite distortion": (
         lambda f: write(f, "SIMPLE_RADIAL", [math.nan]),
-        "sparse/0/cameras: camera 1: k1 must be a finite number, got nan",
+        r"sparse/0/cameras: camera 1 \(SIMPLE_RADIAL\): every number of radial must be finite, got nan",
     ),
     **{
         f"{model.name}": (
-            lambda f, name=model.name: write(f, name, writer=write_colmap_text if name == "FOV" else write_colmap),
-            f"sparse/0/cameras: camera 1 is {model.name}; trained on are pinholes and .*image_undistorter",
+            lambda f, name=model.name: write(f, name, writer=write_colmap_text if name == "EUCM" else write_colmap),
+            f"sparse/0/cameras: camera 1 is {model.name}; rendered are SIMPLE_PINHOLE, .*image_undistorter",
         )
         for model in colmap.MODELS
-        if model.name not in (*lenses.MODELS, *colmap.PINHOLES)
+        if model.name not in io.lenses.NAMES
     },
     "a distorted camera that no picture uses": (lambda f: with_unused(f, "OPENCV"), {"notes": ()}),
-    "a fisheye that no picture uses": (lambda f: with_unused(f, "THIN_PRISM_FISHEYE"), {"notes": ()}),
+    "a model that is refused, which no picture uses": (lambda f: with_unused(f, "EUCM"), {"notes": ()}),
     "a model of the future": (
         lambda f: with_unused(f, "OPENCV", number=99),
         "cameras.bin: camera 77 has a model that is not known here, number 99",
@@ -773,18 +774,18 @@ FOUND = {
         lambda f: only_transforms(f, frames=frames("images/{}.png", 2)),
         "training needs at least 2 pictures, got 1 of 2, .*; --test-every 0 trains with all",
     ),
-    "masks": (masked, {"masks": 9, "warns": "the masks of 9 pictures are ignored"}),
+    "masks": (masked, {"notes": "9 of 9 photographs have a mask, whose black pixels do not count"}),
     **{
         f"masks in {name}": (
             lambda f, name=name: masked(f, name),
-            {"masks": 9, "warns": "the masks of 9 pictures are ignored"},
+            {"ignored_masks": 9, "warns": "9 masks are ignored, all pixels count: masks of photographs belong in"},
         )
-        for name in ("Masks", "images/masks", "images_mask", "dynamic-MASKS/cam0")
+        for name in ("images/masks", "images_mask", "dynamic-MASKS/cam0")
     },
-    "pictures that are no masks": (lambda f: masked(f, "unmasked"), {"masks": 0}),
+    "pictures that are no masks": (lambda f: masked(f, "unmasked"), {"ignored_masks": 0, "notes": ()}),
     "masks of a transforms.json": (
         lambda f: [masked(f), beside(f), shutil.rmtree(f / "sparse")],
-        {"masks": 9, "warns": "the masks of 9 pictures are ignored"},
+        {"ignored_masks": 9, "warns": "9 masks are ignored"},
     ),
     "several models": (
         lambda f: models(f, [3, 9, 5]),
@@ -816,9 +817,9 @@ FOUND = {
         lambda f: [write(f, "OPENCV", [0.1, 0, 0, 0]), beside(f)],
         {"notes": "cameras are those of transforms.json; --cameras takes sparse/0 instead"},
     ),
-    "a pinhole transforms.json beside a fisheye": (
-        lambda f: [write(f, "OPENCV_FISHEYE"), beside(f)],
-        {"notes": "passed over: .*sparse/0/cameras: camera 1 is OPENCV_FISHEYE"},
+    "a pinhole transforms.json beside a model that is refused": (
+        lambda f: [write(f, "EUCM"), beside(f)],
+        {"notes": "passed over: .*sparse/0/cameras: camera 1 is EUCM"},
     ),
     "two descriptions of one lens": (
         lambda f: [write(f, "OPENCV", [0.1, 0, 0, 0]), beside(f, k1=0.1)],
@@ -828,17 +829,17 @@ FOUND = {
         lambda f: [write(f), (f / "transforms.json").write_text("{")],
         {"notes": "passed over: .*transforms.json: not valid JSON"},
     ),
-    "a fisheye in both": (
-        lambda f: [write(f, "OPENCV_FISHEYE"), beside(f, camera_model="OPENCV_FISHEYE")],
-        "camera 1 is OPENCV_FISHEYE",
+    "models that are refused in both": (
+        lambda f: [write(f, "EUCM"), beside(f, camera_model="EUCM")],
+        "camera 1 is EUCM",
     ),
     "a transforms.json of a lens": (
         lambda f: only_transforms(f, camera_model="OPENCV", k1=0.1, k2=-0.02, p1=1e-3),
-        {"notes": RESAMPLED % "OPENCV"},
+        {"notes": EXACT % "perspective"},
     ),
     "a transforms.json of another program": (
         lambda f: only_transforms(f, k1=0.1, k2=0.01),
-        {"notes": RESAMPLED % "OPENCV"},
+        {"notes": EXACT % "perspective"},
     ),
     "a transforms.json of Windows": (
         lambda f: only_transforms(f, frames=frames("images\\{}.png"), test_filenames=[".\\images\\r_4.png"]),
@@ -894,7 +895,7 @@ def test_captures_of_the_field(tmp_path, case):
     for item in photographs:
         if item.view.name in written and found.offset is None and "zero" not in case:
             torch.testing.assert_close(item.view.w2c, written[item.view.name].w2c, rtol=0, atol=1e-6)
-    for name in ("notes", "offset", "masks", "starts_in_view"):
+    for name in ("notes", "offset", "ignored_masks", "starts_in_view"):
         if name == "notes" and isinstance(expected.get(name), str):
             assert any(re.search(expected[name], note) for note in found.notes), found.notes
         elif name in expected:
@@ -911,8 +912,8 @@ def test_cameras_and_pictures_that_are_chosen(tmp_path):
     beside(tmp_path)
     models(tmp_path / "several", [3, 9])
     moved(tmp_path, "several/sparse/0", "distorted/sparse/0")
-    assert training.load_capture(tmp_path, cameras="sparse/0").train[0].lens is not None
-    assert training.load_capture(tmp_path, cameras="transforms.json").train[0].lens is None
+    assert training.load_capture(tmp_path, cameras="sparse/0").train[0].view.lens is not None
+    assert training.load_capture(tmp_path, cameras="transforms.json").train[0].view.lens is None
     few = training.load_capture(tmp_path, cameras="distorted/sparse/0")
     assert len(few.train) == 2 and few.notes == ()
     for wrong in ("sparse/7", "distorted"):
@@ -937,19 +938,33 @@ def test_lenses_of_smaller_pictures(tmp_path):
     smaller = [replace(view, width=70, height=66) for view in views]
     write_grey(tmp_path / "images_2", smaller, [f"{view.name}.png" for view in views])
     whole, half = (
-        training.load_pictures(training.load_capture(tmp_path, images).train, (1,), captures.BLACK, "cpu").views[0]
+        training.load_pictures(
+            training.load_capture(tmp_path, images, lens="undistort").train, (1,), captures.BLACK, "cpu"
+        ).views[0]
         for images in ("images", "images_2")
     )
+    assert whole.lens is half.lens is None
     assert half.fx == whole.fx / 2 and abs(half.width - whole.width / 2) <= 1 and whole.width > 140
     assert abs(half.cx - whole.cx / 2) <= 1
+    found = training.load_capture(tmp_path, "images_2").train
+    (exact,) = training.load_pictures(found[:1], (1,), captures.BLACK, "cpu").views
+    assert (exact.width, exact.height, exact.fx) == (70, 66, 75.0) and exact.lens == ar.Lens.perspective((-0.1,))
 
 
 def test_lenses_can_be_refused(tmp_path):
     write(tmp_path, "SIMPLE_RADIAL", [-0.1])
-    with pytest.raises(io.SceneError, match=r"9 of 9 photographs have lens distortion, .*\(SIMPLE_RADIAL\)"):
+    with pytest.raises(io.SceneError, match=r"9 of 9 photographs have a lens, .*\(perspective\)"):
         training.load_capture(tmp_path, lens="refuse")
-    with pytest.raises(ValueError, match="lens must be one of undistort, refuse, got exact"):
-        training.load_capture(tmp_path, lens="exact")
+    with pytest.raises(ValueError, match="lens must be one of exact, undistort, refuse, got keep"):
+        training.load_capture(tmp_path, lens="keep")
+
+
+def test_a_lens_that_cannot_be_undistorted(tmp_path):
+    write(tmp_path, "OPENCV", [0.3, -59, 0, 0])
+    with pytest.raises(
+        io.SceneError, match=r"r_\d.png: the perspective lens is too wide: \d+% .*leave out --lens undi"
+    ):
+        training.load_capture(tmp_path, lens="undistort")
 
 
 def test_reconstructions_of_new_versions_of_colmap(tmp_path):
@@ -968,7 +983,7 @@ def test_reconstructions_of_new_versions_of_colmap(tmp_path):
         assert any(path.name.startswith("rigs") for path in model.iterdir())
         again = training.load_capture(tmp_path)
         for a, b in zip(before.train, again.train):
-            assert a.lens == b.lens and a.files == b.files
+            assert a.view.lens == b.view.lens and a.files == b.files
             torch.testing.assert_close(a.view.w2c, b.view.w2c, rtol=0, atol=1e-9)
         torch.testing.assert_close(again.points[0].sort(0).values, POINTS.sort(0).values)
         shutil.rmtree(model)
@@ -1045,13 +1060,13 @@ def test_a_checkpoint_without_an_offset_stays_in_the_world(tmp_path):
     assert train(tmp_path / "far", tmp_path / "out", "--iterations", "2") == 0
     path = tmp_path / "out" / files.CHECKPOINT
     state = torch.load(path, weights_only=True)
-    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "undistort"
+    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "exact"
     assert state["source"].pop("cameras") is None
     torch.save(state, path)
     assert train(tmp_path / "far", tmp_path / "out", "--resume") == 0
     resumed = training.Run(tmp_path / "far", tmp_path / "out", resume=True)
-    assert resumed.source["offset"] is None and resumed.source["lens"] == "undistort"
-    with pytest.raises(ValueError, match="lens must be undistort or None where a training is resumed, got refuse"):
+    assert resumed.source["offset"] is None and resumed.source["lens"] == "exact"
+    with pytest.raises(ValueError, match="lens must be exact or None where a training is resumed, got refuse"):
         training.Run(tmp_path / "far", tmp_path / "out", resume=True, lens="refuse")
 
 
@@ -1059,12 +1074,20 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     """Each in a line, by the training and by the test."""
     write(tmp_path / "scene", "SIMPLE_RADIAL", [-0.1])
     (tmp_path / "scene" / "sparse" / "0" / "points3D.bin").unlink()
-    assert train(tmp_path / "scene", tmp_path / "out", "--iterations", "1", "--random-points", "50") == 0
+    assert train(tmp_path / "scene", tmp_path / "exact", "--iterations", "1", "--random-points", "50") == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
-    assert len(said) == 2 and re.search(RESAMPLED % "SIMPLE_RADIAL", said[0])
+    assert len(said) == 2 and re.search(EXACT % "perspective", said[0])
+    assert all(view.lens is not None for view in io.load_views(tmp_path / "exact" / "cameras.json"))
+    assert cli.main(["evaluate", str(tmp_path / "exact"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert json.loads((tmp_path / "exact" / "evaluation.json").read_text())["resampled"] == 0
+    assert re.search(EXACT % "perspective", capsys.readouterr().err)
+    options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
+    assert train(tmp_path / "scene", tmp_path / "out", *options) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
+    assert len(said) == 2 and re.search(RESAMPLED % "perspective", said[0])
     assert said[1] == "no points in the capture: starts from 50 random ones in the views (--points)"
     assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
-    assert re.search(RESAMPLED % "SIMPLE_RADIAL", capsys.readouterr().err)
+    assert re.search(RESAMPLED % "perspective", capsys.readouterr().err)
     assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["resampled"] == 2
     options = ["--lens", "refuse", "--random-points", "50"]
     assert train(tmp_path / "scene", tmp_path / "other", *options) == 2
@@ -1097,21 +1120,18 @@ def test_random_points_are_where_the_cameras_look(where):
 
 def test_the_pictures_of_a_lens_are_those_of_its_pinhole(tmp_path):
     """What is trained on is what a pinhole with the same pose would have seen: the truth, drawn at the cut."""
-    view = io.View("a", 240, 180, 230.0, 230.0, looking_at_origin(0.2), 118.0, 92.0)
-    lens = lenses.lens_of("SIMPLE_RADIAL", {"k1": -0.2}, "")
-    wide = replace(view, width=1000, height=800, fx=690.0, fy=690.0, cx=500.0, cy=400.0)
+    lens = ar.Lens.perspective((-0.2,))
+    view = io.View("a", 240, 180, 230.0, 230.0, looking_at_origin(0.2), 118.0, 92.0, lens=lens)
+    wide = replace(view, lens=None, width=1000, height=800, fx=690.0, fy=690.0, cx=500.0, cy=400.0)
     drawn = torch.from_numpy(draw_picture(wide, opaque=True)).permute(2, 0, 1)[None].double()
     # The photograph: directions of its pixels by inverting the map, colours from a larger picture of the pinhole.
     y, x = np.mgrid[0.5:180, 0.5:240]
-    seen = (x - view.cx) / view.fx, (y - view.cy) / view.fy
-    a, b = seen
-    for _ in range(60):
-        u, v = lens.distorted(a, b)
-        a, b = a - (u - seen[0]), b - (v - seen[1])
+    rays = view.rays_of(torch.from_numpy(np.stack([x, y], -1).reshape(-1, 2))).numpy().reshape(180, 240, 3)
+    a, b = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     places = torch.from_numpy(np.stack([2 * (690 * a + 500) / 1000 - 1, 2 * (690 * b + 400) / 800 - 1], -1))[None]
     photograph = torch.nn.functional.grid_sample(drawn, places, align_corners=False)[0].round().to(torch.uint8)
     rgba = torch.cat([photograph, torch.full_like(photograph[:1], 255)]).permute(1, 2, 0)
-    found, resampled = lenses.without_lens(rgba, view, lens)
+    found, resampled = undistortion.without_lens(rgba, view)
     expected = draw_picture(found, opaque=True)
     error = (resampled[..., :3].double() - torch.from_numpy(expected)) / 255
     assert -10 * error.square().mean().log10() > 45

@@ -299,3 +299,16 @@ def test_trained_scenes(name, request):
     assert found.footprint != "box:samples=1" and found.effects.filter_3d is None
     assert found.views[0].narrow > 0.9
     assert found.shown.sum() > 0.9 * len(scene.means) or name == "hqgarden"
+
+
+def test_a_lens_belongs_to_the_camera():
+    """What is recommended is measured in its pictures."""
+    scene = random_scene("cpu", count=100)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 4.0
+    view = io.View("v", 83, 61, 60.0, 60.0, pose, lens=ar.Lens.fisheye((0.05,)))
+    settings = view.settings()
+    got = planner._stages(scene, settings, "box:samples=1", ar.Effects())
+    expected = ar.render_stages(settings._replace(footprint="box:samples=1", sh_degree=0), **scene.arguments())
+    assert torch.equal(got.color, expected.color)
+    assert planner.inspect_scene(scene, [view], rounds=1).views[0].shown > 0

@@ -215,7 +215,6 @@ def test_devices_and_precisions_agree(device, lens):
         (lambda: ar.Lens.fov(0.0), "w of a fov lens must be above 0"),
         (lambda: ar.Lens("fisheye", torch.zeros(3)), r"coefficients must have shape \(12,\), got \(3,\)"),
         (lambda: ar.Effects(lens=ar.Lens.fisheye(), orthographic=True), "lens must be None for an orthographic"),
-        (lambda: ar.compute_3d_filter(torch.zeros(2, 3), [settings_of(ar.Lens.fisheye())]), "got a fisheye lens"),
     ],
 )
 def test_what_is_refused(make, match):

@@ -397,6 +397,58 @@ def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, optio
     assert (tmp_path / "whole" / files.SCENE).read_bytes() == (tmp_path / "part" / files.SCENE).read_bytes()
 
 
+@pytest.mark.filterwarnings("error:.*deterministic")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"density": "3dgs", "supersampling": 2, "filter_3d": True},
+        {"density": "mcmc", "background": "random", "pictures_per_step": 2, "sparse_adam": True},
+    ],
+    ids=["absgrad", "3dgs", "mcmc"],
+)
+def test_a_deterministic_training_counts_every_frame(device, synthetic, tmp_path, monkeypatch, options):
+    """In torch's deterministic mode, without operators that would break it, and with the bits of other trainings."""
+    common = {"iterations": 75, "densify_until": 0.9, **options}  # changes after steps 40 and 60
+    runs = [make_run(synthetic, tmp_path / str(on), device, deterministic=on, **common) for on in (False, True)]
+    modes, following = [], schedule.PictureOrder.__call__
+    note = lambda order, n: (modes.append(torch.get_deterministic_debug_mode()), following(order, n))[1]  # noqa: E731
+    monkeypatch.setattr(schedule.PictureOrder, "__call__", note)
+    for run, mode in zip(runs, (0, 1)):
+        modes.clear()
+        run.train()
+        assert len(modes) >= 75 and set(modes) == {mode}
+        assert torch.get_deterministic_debug_mode() == 0
+    assert len(runs[0].trainer.gaussians.means) != 150
+    for name, one, other in zip(Gaussians._fields, *(run.trainer.gaussians for run in runs)):
+        assert torch.equal(one, other), name
+
+
+def test_a_deterministic_step_leaves_the_mode_of_the_program(synthetic, tmp_path, monkeypatch):
+    """A stricter one stays on in the step, and an error ends what the step has switched on."""
+    run = make_run(synthetic, tmp_path, deterministic=True)
+    modes = []
+    monkeypatch.setattr(run.trainer, "_set_rates", lambda: modes.append(torch.get_deterministic_debug_mode()) or 1 / 0)
+    for before in (0, 2):
+        torch.set_deterministic_debug_mode(before)
+        try:
+            with pytest.raises(ZeroDivisionError):
+                run.trainer.step()
+            assert torch.get_deterministic_debug_mode() == before
+        finally:
+            torch.set_deterministic_debug_mode(0)
+    assert modes == [1, 2]
+
+
+def test_the_command_takes_deterministic(synthetic, tmp_path, capsys):
+    arguments = ["train", str(synthetic), "--out", str(tmp_path), "--deterministic", "--device", "cpu"]
+    assert cli.main([*arguments, "--seconds", "5"]) == 2
+    assert "--deterministic has no effect: by the clock, every run has another number" in capsys.readouterr().err
+    small = ["--iterations", "3", "--random-points", "50", "--no-evaluate"]
+    assert cli.main([*arguments, *small]) == 0
+    assert json.loads((tmp_path / files.OPTIONS).read_text())["options"]["deterministic"] is True
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -964,7 +1016,7 @@ def test_example_trains(synthetic, tmp_path):
 
 
 def test_evaluate_needs_pictures():
-    empty = pictures.Pictures([], {1: []}, {1: []})
+    empty = pictures.Pictures([], {1: []}, {1: []}, {1: []})
     with pytest.raises(ValueError, match="pictures must have at least one view, got none"):
         evaluate(truth_gaussians().map(torch.Tensor.detach), empty, "box")
 

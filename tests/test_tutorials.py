@@ -300,6 +300,7 @@ def test_antialias(tmp_path):
     names = "point", "box", "moment"
     assert len({picture(repository / f"{name}.png").tobytes() for name in names}) == len(names)
     results = json.loads((out / "evaluation.json").read_text())["results"]
+    assert io.read_metadata(repository / "garden.ply").footprint == "moment:samples=4"
     ours, theirs = (results[name] for name in ("moment:samples=4", "point:dilation=0.3"))
     assert all(ours[scale]["psnr"] > theirs[scale]["psnr"] + 1 for scale in ("4", "8"))
 

@@ -10,6 +10,7 @@ import types
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -370,6 +371,17 @@ def test_views_can_be_stepped_through(live_viewer):
             browser.choose("Jump to", button)
             client = next(iter(live_viewer._clients.values()))
             browser.wait_for(lambda name=name, client=client: client.view_name.value == name)
+
+
+def test_the_lens_of_a_view_is_shown_and_can_be_switched_off():
+    pytest.importorskip("viser", reason="needs the view extra")
+    scene, lens = make_scene(), ar.Lens.fisheye((0.05,))
+    with viewer.LiveViewer(views=[replace(make_view("front"), lens=lens), make_view("other")]) as running:
+        running.update(scene)
+        with connected(running.url) as browser:
+            browser.wait_for_picture(expected_frame(scene, replace(front(), lens=lens), "analytic"))
+            browser.choose("Lens of the view", False)
+            browser.wait_for_picture(expected_frame(scene, front(), "analytic"))
 
 
 def counted_frames(monkeypatch):

@@ -74,7 +74,7 @@ def inspect_scene(
 
     Args:
         scene: P Gaussians on the device to measure on.
-        views: What it will be seen from, at least one. Footprint and effects of settings are ignored.
+        views: What it will be seen from, at least one. Footprint and effects of settings are ignored, but for lenses.
         tolerance: Root mean square over the pixels and channels of each view, in units of colour, not negative.
         training_views: What the scene was trained from, at their size; None: the 3D filter is not examined.
         scale: Resolution of `io.View`s among the views, as a factor.
@@ -203,7 +203,9 @@ def _prepare(scene: Gaussians, camera, footprint: str, effects: Effects) -> tupl
     if effects.filter_3d is not None:
         filtered = apply_3d_filter(scene.scales, scene.opacities, effects.filter_3d)
         gaussians["scales"], gaussians["opacities"] = filtered
-    options = {"footprint": footprint, "sh_degree": scene.sh_degree, "effects": replace(effects, filter_3d=None)}
+    lens = camera.effects.lens if isinstance(camera.effects, Effects) else None  # of the camera, and no choice
+    effects = replace(effects, filter_3d=None, lens=lens)
+    options = {"footprint": footprint, "sh_degree": scene.sh_degree, "effects": effects}
     return camera._replace(**options), gaussians
 
 

@@ -78,8 +78,8 @@ def check_is_dilated(found: io.FoundScene, trained: io.Choice) -> None:
     footprint = trained.footprint
     if footprint.name != DILATED:
         raise io.SceneError(
-            f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}); "
-            "--footprint point is for a scene that was trained with 3DGS all the same"
+            f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}: "
+            f"{trained.reason}); --footprint point is for a scene that was trained with 3DGS all the same"
         )
     if not io.is_dilated(footprint):
         raise io.SceneError(f"{found.path}: no dilation to bake: it was trained with {footprint}, without any")

@@ -11,7 +11,7 @@ from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
-from ..training.captures import IMAGES, TEST_PERIOD, Capture
+from ..training.captures import CHOICES, IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
@@ -94,7 +94,7 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     if found.options is not None:
         try:
             source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-            reading = {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+            reading = {name: source[name] for name in ("cameras", *CHOICES) if name in source}
             named = source["scene"], source["images"], source["test_every"]
             usual = Protocol(*named, options.scales, reading, options)
         except (ValueError, KeyError, TypeError) as error:
@@ -159,7 +159,7 @@ def run_on(ranks: Ranks, args) -> None:
     if ranks.is_first:
         views = [view.name for view in pictures.views]
         written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
-        written["resampled"] = sum(item.lens is not None for item in capture.test)
+        written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
         print(format_results(results, protocol.scales))

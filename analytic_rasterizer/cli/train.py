@@ -15,7 +15,7 @@ from .. import io
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import Run, TrainingOptions
-from ..training.captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD
+from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.health import flag
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
@@ -56,6 +56,8 @@ MAIN = {
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
     "seed": "of everything that is drawn",
     "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
+    "deterministic": "the same bits in every run on CUDA too, also after a sudden rise of pairs; slower, for the host "
+    "waits for every frame (a CPU always gives the same bits)",
     "density": f"density control: {', '.join(DENSITIES)}",
     "max_gaussians": "start with no more than this, and grow no further, evenly towards it; 0: no limit",
     "random_points": "Gaussians at the start where SCENE has no points (default: 100000, or --max-gaussians where that "
@@ -91,10 +93,14 @@ def add_parser(subcommands) -> None:
     add("--test-every", type=int, metavar="N", help=test_every)
     cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
     add("--cameras", metavar="NAME", help=cameras)
-    lens = "photographs with lens distortion are resampled to pinholes, or an error (default: undistort)"
-    add("--lens", choices=LENS_CHOICES, help=lens)
-    missing = "pictures that are not there are an error, or left out with their cameras (default: refuse)"
-    add("--missing", choices=MISSING_CHOICES, help=missing)
+    choices = {
+        "lens": "photographs with a lens are rendered with it, resampled to pinholes, or an error",
+        "missing": "pictures that are not there are an error, or left out with their cameras",
+        "masks": "black pixels of masks do not count, or masks are ignored",
+        "alpha": "a background is seen through transparent pixels, or they do not count",
+    }
+    for name, text in choices.items():
+        add(f"--{name}", choices=CHOICES[name], help=f"{text} (default: {CHOICES[name][0]})")
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
@@ -189,6 +195,8 @@ def run_on(ranks: Ranks, args) -> bool:
         cameras=args.cameras,
         lens=args.lens,
         missing=args.missing,
+        masks=args.masks,
+        alpha=args.alpha,
         save_every=args.save_every,
         resume=args.resume,
         **length,

@@ -20,13 +20,16 @@ from ..footprints import (
     COMPENSATED,
     DILATED,
     ENVIRONMENT_VARIABLE,
+    PAPER,
     Footprint,
     chosen_footprint,
     resolve_footprint,
 )
+from . import ply
 from .common import BACKGROUNDS, BLACK, WHITE, SceneError
 from .metadata import SceneMetadata, read_metadata
 from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
+from .scenes import FILTER_3D
 from .views import load_views
 
 SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"  # of the folder of a training
@@ -58,6 +61,7 @@ class FoundScene:
         cfg_args: What cfg_args of 3DGS says, beside it or in the folder of the model; None where there is none.
         model: That folder.
         cameras: cameras.json, beside it or in the folder of the model; None where there is none.
+        has_filter_3d: Whether the file is a .ply with the column filter_3D, which Mip-Splatting and its kin write.
     """
 
     path: Path
@@ -66,6 +70,7 @@ class FoundScene:
     cfg_args: CfgArgs | None = None
     model: Path | None = None
     cameras: Path | None = None
+    has_filter_3d: bool = False
 
     @property
     def is_trained_here(self) -> bool:
@@ -89,6 +94,16 @@ class FoundScene:
         if self.is_trained_here:
             trained = self.options["options"]["footprint"]
             return Choice(resolve_footprint(trained), f"{OPTIONS} beside {self.path.name} says so")
+        if self.cfg_args is not None and self.cfg_args.kernel_size is not None:
+            size = self.cfg_args.kernel_size
+            reason = f"{CFG_ARGS} says kernel_size {size:g}, the variance of Mip-Splatting's filter"
+            return Choice(resolve_footprint(COMPENSATED, variance=size), reason)
+        if self.has_filter_3d:
+            reason = (
+                f"{self.path.name} has the column {FILTER_3D} of Mip-Splatting; Analytic-Splatting writes it too, "
+                f"then give --footprint {PAPER}"
+            )
+            return Choice(ANTIALIASED, reason)
         if self.metadata.antialiased:
             reason = f"{self.path.name} says that it was trained with an antialiasing filter, and not which"
             return Choice(ANTIALIASED, reason)
@@ -219,7 +234,14 @@ def find_scene(path) -> FoundScene:
         cfg_args=None if cfg_args is None else read_cfg_args(cfg_args),
         model=root,
         cameras=cameras,
+        has_filter_3d=_has_filter_3d(path),
     )
+
+
+def _has_filter_3d(path: Path) -> bool:
+    """Whether a file that is there is a .ply with this column."""
+    vertex = ply.read_header(path).element("vertex") if path.suffix.lower() == ".ply" else None
+    return vertex is not None and FILTER_3D in vertex.names
 
 
 def _file_in(folder: Path) -> Path:

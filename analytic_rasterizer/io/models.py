@@ -31,6 +31,7 @@ class CfgArgs:
         images: Folder of the photographs in the capture. images_4 has them at a quarter of the size.
         source_path: The capture.
         eval: Whether pictures were kept for the test.
+        kernel_size: Of Mip-Splatting and its kin alone: variance of the 2D filter, px^2.
     """
 
     white_background: bool | None = None
@@ -38,6 +39,7 @@ class CfgArgs:
     images: str | None = None
     source_path: str | None = None
     eval: bool | None = None
+    kernel_size: float | None = None
 
     @property
     def images_reduction(self) -> int:
@@ -113,9 +115,11 @@ def _literal(node: ast.expr | None) -> Any:
 
 
 def _fits(name: str, value: Any) -> bool:
-    if name == "resolution":
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return is_number and (value == -1 or 0 < value <= 2**20)
+    if name in ("resolution", "kernel_size"):
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            return False
+        # A larger kernel_size is the width of a window, of a program that blurs.
+        return 0 <= value <= 1 if name == "kernel_size" else value == -1 or 0 < value <= 2**20
     return isinstance(value, str if name in ("images", "source_path") else bool)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,9 @@ import torch
 
 from ..camera import View
 from .common import SceneError, first_line, opened_picture
+from .lenses import lens_from_json, lens_of_transforms, lens_to_json
 from .pictures import PictureFiles
 from .writing import write_text
-
-# What an entry of a transforms file may say of the lens; nothing, or zeros, for a pinhole.
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
-PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
@@ -32,29 +28,20 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
     - a list of {width, height, fx, fy, w2c} with w2c world-to-camera, 16 numbers by rows or 4 x 4.
 
     cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2). The first and the last may
-    have `offset`, which positions are relative to, see `View`. Views of a transforms file that states no image size
+    have `offset`, which positions are relative to, see `View`, and `lens`: {model, coefficients}, as of `Lens`. The
+    second may have a lens by camera_model and k1, k2, ... as nerfstudio has, globally or by frame. Views of a
+    transforms file that states no image size
     have `size` = (width, height), or that of their pictures; where a picture is missing, that of the first that exists.
-
-    Warns of lens distortion, which is ignored.
 
     Raises:
         SceneError: Something is missing, malformed, not finite or not positive, or the list is empty. The message names
             the file and the entry.
     """
-    views, data = read_views(path, size)
-    shared = {key: value for key, value in data.items() if key != "frames"} if isinstance(data, dict) else {}
-    named = [distortion_of(shared | entry) for entry in (data["frames"] if isinstance(data, dict) else data)]
-    if any(named):
-        names = ", ".join(dict.fromkeys(name for names in named for name in names))
-        number = sum(map(bool, named))
-        warnings.warn(
-            f"{path}: the lens distortion of {number} views ({names}) is ignored: they are pinholes", stacklevel=2
-        )
-    return views
+    return read_views(path, size)[0]
 
 
 def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], Any]:
-    """What `load_views` returns, with the content of the file. Says nothing of distortion. Raises as that does."""
+    """What `load_views` returns, with the content of the file. Raises as that does."""
     path = Path(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -69,12 +56,6 @@ def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], A
     return with_distinct_names(views), data
 
 
-def distortion_of(entry: dict) -> dict[str, Any]:
-    """What an entry of a transforms file, with what all share, says of the lens beyond a pinhole, by name."""
-    found = {name: entry.get(name) for name in DISTORTION}
-    return {name: value for name, value in found.items() if any(value if isinstance(value, list) else [value])}
-
-
 def save_views(path, views: list[View]) -> None:
     """Writes `views` to the file `path`, as the plain list of `load_views`.
 
@@ -85,6 +66,7 @@ def save_views(path, views: list[View]) -> None:
     for view in views:
         entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
         entry |= {k: getattr(view, k) for k in ("cx", "cy", "offset") if getattr(view, k) is not None}
+        entry |= {} if view.lens is None else {"lens": lens_to_json(view.lens)}
         entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
     write_text(path, json.dumps(entries, indent=1) + "\n")
 
@@ -92,7 +74,6 @@ def save_views(path, views: list[View]) -> None:
 def _views(data, folder: Path, size) -> list[View]:
     if isinstance(data, dict) and "frames" in data:
         frames = _entries(data["frames"], "frames")
-        _check_camera_model(data.get("camera_model"))
         sizes = [size] * len(frames)
         if size is None and not any("w" in frame for frame in [data, *frames]):
             sizes = _picture_sizes(folder, frames)
@@ -136,13 +117,14 @@ def _listed_view(i: int, entry: dict) -> View:
         cx=_optional(entry, "cx", where),
         cy=_optional(entry, "cy", where),
         offset=None if entry.get("offset") is None else checked_offset(entry["offset"], f"{where}: offset"),
+        lens=None if entry.get("lens") is None else lens_from_json(entry["lens"], f"{where}: lens"),
     )
 
 
 def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
     where = f"frame {i}"
     entry = shared | frame  # a frame's own intrinsics go before the shared ones
-    _check_camera_model(entry.get("camera_model"), f"{where}: ")
+    lens = lens_of_transforms(entry, where)
     if "w" in entry or "h" in entry:
         width = checked_pixels(_get(entry, "w", where), f"{where}: w")
         height = checked_pixels(_get(entry, "h", where), f"{where}: h")
@@ -169,6 +151,7 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
         w2c=torch.linalg.inv(c2w),
         cx=_optional(entry, "cx", where),
         cy=_optional(entry, "cy", where),
+        lens=lens,
     )
 
 
@@ -182,15 +165,6 @@ def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> flo
     if value >= math.pi:
         raise SceneError(f"{where}: {angle} must be below pi (radians), got {value}")
     return extent / (2 * math.tan(value / 2))
-
-
-def _check_camera_model(model, where: str = "") -> None:
-    if model is not None and model not in PERSPECTIVE_MODELS:
-        raise SceneError(
-            f"{where}camera_model must be that of a pinhole camera, got {model!r}; of lenses, training takes those of "
-            f"{', '.join(PERSPECTIVE_MODELS[2:])}: undistort the pictures first, with COLMAP's image_undistorter for "
-            "example"
-        )
 
 
 def _picture_sizes(folder: Path, frames: list[dict]) -> list[tuple[int, int] | None]:

@@ -12,17 +12,16 @@ import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .. import io
+from ..io.lenses import lens_of_colmap
 from ..io.views import with_distinct_names
 from ..rotations import rotation_matrices
-from .lenses import MODELS as LENSES
-from .lenses import Lens, lens_of
 
 
 class Model(NamedTuple):
@@ -55,18 +54,16 @@ MODELS = (
 )
 BY_NUMBER = {model.number: model for model in MODELS}
 BY_NAME = {model.name: model for model in MODELS}
-PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")  # f, cx, cy and fx, fy, cx, cy
 
 CAMERAS, IMAGES, POINTS = "cameras", "images", "points3D"
 SUFFIXES = (".bin", ".txt")
 
 
 class Registered(NamedTuple):
-    """A picture with its camera, which is a pinhole but for its lens."""
+    """A picture with its camera."""
 
     name: str  # of the file, below the folder of the pictures
     view: io.View
-    lens: Lens | None
     camera: str  # and its model, for messages
 
 
@@ -92,8 +89,8 @@ def load_views(folder: Path) -> list[Registered]:
     views of all but the first have _2, _3, ... behind it. What cameras are that no picture was taken by is not looked
     at.
 
-    Raises io.SceneError for a file that is cut short or holds numbers that are not finite, and for cameras that are
-    neither pinholes nor have a lens of `lenses.MODELS`, OSError for a missing file.
+    Raises io.SceneError for a file that is cut short or holds numbers that are not finite, and for cameras of models
+    that `io.lenses` does not know, OSError for a missing file.
     """
     cameras = {camera: rest for camera, *rest in _cameras(folder)}
     intrinsics: dict = {}
@@ -108,28 +105,19 @@ def load_views(folder: Path) -> list[Registered]:
         w2c = torch.eye(4, dtype=torch.float64, device="cpu")
         w2c[:3, :3] = rotation_matrices(torch.tensor(pose[:4], dtype=torch.float64, device="cpu"))
         w2c[:3, 3] = torch.tensor(pose[4:], dtype=torch.float64, device="cpu")
-        pinhole, lens = intrinsics[camera]
-        view = io.View(name=_view_name(file_name), w2c=w2c, **pinhole)
-        found.append(Registered(file_name, view, lens, f"camera {camera} ({cameras[camera][0]})"))
+        view = io.View(name=_view_name(file_name), w2c=w2c, **intrinsics[camera])
+        found.append(Registered(file_name, view, f"camera {camera} ({cameras[camera][0]})"))
     found.sort(key=lambda item: item.name)
     views = with_distinct_names([item.view for item in found])
     return [item._replace(view=view) for item, view in zip(found, views)]
 
 
-def _intrinsics(where: str, model: str, width: int, height: int, parameters: list[float]) -> tuple[dict, Lens | None]:
-    """Members of `View`, and the lens. Raises io.SceneError, which begins with `where`, the camera."""
-    if model not in PINHOLES and model not in LENSES:
-        raise io.SceneError(
-            f"{where} is {model}; trained on are pinholes and {', '.join(LENSES)}: undistort the pictures first, with "
-            "COLMAP's image_undistorter, and train on the folder that it writes"
-        )
-    names = LENSES.get(model, ())
-    count = len(parameters) - len(names)
-    *focal, cx, cy = parameters[:count]
-    if not all(map(math.isfinite, (*focal, cx, cy))) or min(focal) <= 0 or width < 1 or height < 1:
+def _intrinsics(where: str, model: str, width: int, height: int, parameters: list[float]) -> dict[str, Any]:
+    """Members of `View`. Raises io.SceneError, which begins with `where`, the camera."""
+    if width < 1 or height < 1:
         raise io.SceneError(f"{where} must have a positive size and focal length")
-    lens = lens_of(model, dict(zip(names, parameters[count:])), where)
-    return {"width": width, "height": height, "fx": focal[0], "fy": focal[-1], "cx": cx, "cy": cy}, lens
+    pinhole, lens = lens_of_colmap(model, parameters, where)
+    return {"width": width, "height": height, "lens": lens, **pinhole}
 
 
 def _view_name(file_name: str) -> str:

@@ -48,11 +48,8 @@ def seen_distance(views: Sequence[View], points: Tensor) -> float:
     w2c = torch.stack([view.w2c for view in views]).double()
     distances = []
     for view, seen in zip(views, points @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]):
-        x, y, z = seen.unbind(1)
-        cx = view.width / 2 if view.cx is None else view.cx
-        cy = view.height / 2 if view.cy is None else view.cy
-        column, row = x / z * view.fx + cx, y / z * view.fy + cy
-        shown = (z > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+        column, row = view.pixels_of(seen).unbind(1)
+        shown = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
         if shown.any():
             distances.append(seen[shown].norm(dim=1).median())
     return torch.stack(distances).median().item() if distances else 0.0

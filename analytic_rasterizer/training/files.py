@@ -12,6 +12,7 @@ import torch
 from .. import io
 from ..gaussians import Gaussians
 from ..io.appearance import CAMERAS, OPTIONS, SCENE  # noqa: F401  (the names by which commands find them)
+from ..io.lenses import lens_to_json
 from ..io.writing import as_json, write_json, write_safely, write_text
 
 CHECKPOINT = "checkpoint.pt"
@@ -83,6 +84,7 @@ def write_cameras(path: Path, views: list[io.View]) -> None:
         entry = {"id": i, "img_name": view.name, "width": view.width, "height": view.height}
         entry |= {"position": c2w[:3, 3].tolist(), "rotation": c2w[:3, :3].tolist(), "fx": view.fx, "fy": view.fy}
         entry |= {key: getattr(view, key) for key in ("cx", "cy", "offset") if getattr(view, key) is not None}
+        entry |= {} if view.lens is None else {"lens": lens_to_json(view.lens)}  # which others do not read
         entries.append(entry)
     write_json(path, entries)
 

@@ -1,8 +1,7 @@
 """The layouts of captures: what each of them says of its photographs.
 
 They are NeRF-synthetic scenes (transforms_train.json), the multi-scale Blender set (metadata.json), COLMAP
-reconstructions (folders of binary or text files) and nerfstudio captures (transforms.json). Cameras are pinholes, or
-have a lens of `lenses`.
+reconstructions (folders of binary or text files) and nerfstudio captures (transforms.json).
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from torch import Tensor
 from .. import io
 from ..io import BLACK, WHITE, load_points
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
-from ..io.views import checked_pixels, checked_pose, checked_positive, distortion_of, read_views
+from ..io.views import checked_pixels, checked_pose, checked_positive, read_views
 from . import colmap
-from .lenses import RATIONAL, Lens, lens_of, window_of
 
+MASKS = "masks"  # COLMAP's folder of them, beside that of the pictures
 MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
 
 
@@ -30,14 +29,18 @@ class Photograph(NamedTuple):
     """A camera, and the files of its picture.
 
     Attributes:
-        view: The camera without the lens, and of the size of the whole picture.
+        view: The camera, of the size of the whole picture.
         files: By scale, where 2 is half the size. 1 is always there, and makes the scales that are not.
-        lens: What `load_pictures` removes from the picture; None for a pinhole.
+        undistort: Whether `load_pictures` resamples the picture to that of a pinhole.
+        mask: The file of its mask, whose black pixels do not count; None: all pixels count.
+        alpha_is_mask: Whether transparent pixels do not count; otherwise a background is seen through them.
     """
 
     view: io.View
     files: dict[int, Path]
-    lens: Lens | None = None
+    undistort: bool = False
+    mask: Path | None = None
+    alpha_is_mask: bool = False
 
 
 class Capture(NamedTuple):
@@ -51,7 +54,7 @@ class Capture(NamedTuple):
             the same.
         starts_in_view: Whether random points belong in the views, where there are no others, or in the cube of
             NeRF-synthetic.
-        masks: How many pictures have a mask, which is ignored.
+        ignored_masks: How many files of masks there are that belong to no convention.
         notes: Sentences of what was chosen, for the user.
     """
 
@@ -61,7 +64,7 @@ class Capture(NamedTuple):
     points: tuple[Tensor, Tensor] | None
     offset: tuple[float, float, float] | None = None
     starts_in_view: bool = False
-    masks: int = 0
+    ignored_masks: int = 0
     notes: tuple[str, ...] = ()
 
 
@@ -84,7 +87,7 @@ def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capt
 def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> Capture:
     """The capture of a COLMAP reconstruction whose pictures are in a folder `images` of `folder`.
 
-    Raises io.SceneError for what `colmap.load_views` refuses, and for lenses that cannot be undistorted.
+    Raises io.SceneError for what `colmap.load_views` refuses.
     """
     if not colmap.is_reconstruction(sparse):
         raise io.SceneError(f"{sparse}: expected COLMAP's cameras and images (.bin or .txt)")
@@ -96,61 +99,40 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
         expected = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
         raise io.SceneError(f"{folder / images}: no such folder; {expected}")
     files = PictureFiles(folder / images)
-    items = []
-    for item in registered:
-        _check_lens(item.lens, item.view, f"{sparse}/cameras: {item.camera}")
-        items.append(Photograph(item.view, {1: files.find(item.name)}, item.lens))
+    masks = PictureFiles(folder / MASKS)
+    items = [Photograph(item.view, {1: files.find(item.name)}, mask=_mask_of(masks, item.name)) for item in registered]
     points = colmap.load_points(sparse)
-    masks = _count_masks(folder, folder / images)
     return Capture(
         *_split(folder, items, test_every),
         BLACK,
         initial_points(sparse) if points is None else points,
         starts_in_view=True,
-        masks=masks,
+        ignored_masks=0 if any(item.mask for item in items) else _count_masks(folder, folder / images),
     )
 
 
-def _check_lens(lens: Lens | None, view: io.View, where: str) -> None:
-    """Raises io.SceneError, which begins with `where`, for a lens that cannot be undistorted."""
-    if lens is None:
-        return
-    try:
-        window_of(lens, view)
-    except io.SceneError as error:
-        raise io.SceneError(f"{where}: {error}; undistort the pictures first, with another model") from None
+def _mask_of(masks: PictureFiles, name: str) -> Path | None:
+    """The mask of a picture as COLMAP names it, NAME.png, or of the same name; None where there is none."""
+    found = (masks.find(candidate) for candidate in (f"{name}.png", name))
+    return next((path for path in found if path.is_file()), None)
 
 
 def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
     """The views of a transforms file and where their pictures are, in the order of the file; and all that it says.
 
-    Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lenses that
-    cannot be undistorted.
+    Raises io.SceneError for what `io.load_views` refuses, and for lists of cameras, which it reads too.
     """
     views, data = read_views(path)
     if not isinstance(data, dict):
         raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
-    found = []
     files = PictureFiles(path.parent)
+    found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
-        where = f"{path}: frame {i}"
-        lens = _lens_of_frame(data | frame, where)
-        _check_lens(lens, view, where)
-        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, lens))
+        mask = frame.get("mask_path")
+        if mask is not None and not (isinstance(mask, str) and (mask := files.find(mask)).is_file()):
+            raise io.SceneError(f"{path}: frame {i}: mask_path must name a picture beside the file, got {mask!s}")
+        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, mask=mask))
     return found, data
-
-
-def _lens_of_frame(entry: dict[str, Any], where: str) -> Lens | None:
-    """The lens of a frame of a transforms file, with what all frames share. Raises io.SceneError."""
-    said = distortion_of(entry)
-    model = entry.get("camera_model") or "OPENCV"
-    unknown = {"distortion_params", "is_fisheye"} | (set() if model == RATIONAL else {"k5", "k6"})
-    for name in unknown & said.keys():
-        raise io.SceneError(
-            f"{where}: lenses must be those of OpenCV (k1, k2, k3, k4, p1, p2), got {name} = {said[name]}; undistort "
-            "the pictures first"
-        )
-    return lens_of(model, said, where)
 
 
 def nerfstudio(path: Path, test_every: int) -> Capture:
@@ -173,7 +155,7 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
     else:
         raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
     items.sort(key=lambda item: str(item.files[1]))
-    masks = sum(frame.get("mask_path") is not None for frame in data["frames"]) or _count_masks(path.parent)
+    ignored = 0 if any(item.mask for item in items) else _count_masks(path.parent)
     pictures, lists = PictureFiles(path.parent), {}
     files = [os.path.normpath(item.files[1]) for item in items]
     for split in ("train", "val", "test"):
@@ -190,7 +172,7 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
         splits = [[item for file, item in zip(files, items) if file in names] for names in (train, test)]
     else:
         splits = _split(path.parent, items, test_every)
-    return Capture(*splits, BLACK, points, starts_in_view=True, masks=masks)
+    return Capture(*splits, BLACK, points, starts_in_view=True, ignored_masks=ignored)
 
 
 def has_splits(path: Path) -> bool:

@@ -122,6 +122,9 @@ class TrainingOptions:
         sparse_adam: Whether a step of the optimizer updates only the Gaussians that at least one of its pictures shows
             (3DGS's radii > 0), as 3DGS's `--optimizer_type sparse_adam` does. The others keep parameters and moments,
             whatever regularizers would do to them.
+        deterministic: Whether every run has the same bits on CUDA too, whose frames with a sudden rise of pairs else
+            may differ in the last bits: torch's deterministic mode is on during every step, so that the host waits for
+            the number of pairs. Operators of torch without a deterministic algorithm would warn.
         density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
             absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
         densify_from: Time before the first change; -1: 500 steps, or a fourteenth of a training of fewer than 7,000. In
@@ -178,6 +181,7 @@ class TrainingOptions:
     rates_from: float = 7000.0
     rates_half_life: int = 7000
     sparse_adam: bool = False
+    deterministic: bool = False
     density: str = "absgrad"
     densify_from: float = -1.0
     densify_until: float = 0.75

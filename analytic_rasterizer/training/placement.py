@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..lens import WIDE
 from .extent import ROUNDING, places_of
 
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
@@ -54,13 +55,17 @@ def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor,
     uniform = torch.rand(count, 3, generator=generator, dtype=torch.float64, device="cpu")
     chosen = torch.randint(len(views), (count,), generator=generator, device="cpu")
     z = depth * NEAREST_DEPTH * (FARTHEST_DEPTH / NEAREST_DEPTH) ** uniform[:, 2]
-    middles = [(v.width / 2 if v.cx is None else v.cx, v.height / 2 if v.cy is None else v.cy) for v in views]
-    size, middle, focal = (
-        torch.tensor(rows, dtype=torch.float64, device="cpu")[chosen]
-        for rows in ([(v.width, v.height) for v in views], middles, [(v.fx, v.fy) for v in views])
-    )
-    xy = (uniform[:, :2] * size - middle) / focal * z[:, None]
-    in_camera = torch.cat([xy, z[:, None], torch.ones_like(z[:, None])], 1)
+    size = torch.tensor([(v.width, v.height) for v in views], dtype=torch.float64, device="cpu")[chosen]
+    pixels, rays = uniform[:, :2] * size, torch.empty_like(uniform)
+    for i in chosen.unique().tolist():
+        of_view = chosen == i
+        rays[of_view] = views[i].rays_of(pixels[of_view])
+    # Depths are z, of wide lenses distances.
+    wide = torch.tensor([v.lens is not None and v.lens.model in WIDE for v in views])[chosen]
+    positions = rays * (z / torch.where(wide, 1.0, rays[:, 2]))[:, None]
+    # Where a lens shows nothing, a point is ahead.
+    positions = torch.where(positions.isfinite(), positions, torch.stack([0 * z, 0 * z, z], 1))
+    in_camera = torch.cat([positions, torch.ones_like(z[:, None])], 1)
     c2w = torch.linalg.inv(torch.stack([view.w2c for view in views]))
     points = (c2w[chosen] @ in_camera[:, :, None])[:, :3, 0]
     return points.float(), torch.full((count, 3), 0.5, dtype=torch.float32, device="cpu")

@@ -64,8 +64,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every, cameras, lens, missing: As `load_capture`; None: as is usual there. With `resume` None, or
-            the same as when the training began.
+        images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
+            `resume` None, or the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -101,6 +101,8 @@ class Run:
         cameras: str | None = None,
         lens: str | None = None,
         missing: str | None = None,
+        masks: str | None = None,
+        alpha: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         iterations: int | None = None,
@@ -124,7 +126,7 @@ class Run:
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
-        given |= {"cameras": cameras, "lens": lens, "missing": missing}
+        given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
         self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
         self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
         self.source["offset"] = self.capture.offset

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -16,7 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
-from ..losses import l1_ssim
+from ..losses import counted, l1_ssim
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .extent import extent_of
@@ -45,11 +47,26 @@ class Shown(NamedTuple):
     background: Tensor | None  # (3,) that was drawn for it
 
 
+@contextmanager
+def deterministic_mode() -> Iterator[None]:
+    """torch's deterministic mode, in which CUDA frames count their pairs. One that is on already stays as it is.
+
+    Operators without a deterministic algorithm warn. Not by `use_deterministic_algorithms`, which imports the compiler.
+    """
+    before = torch.get_deterministic_debug_mode()
+    torch.set_deterministic_debug_mode(before or "warn")
+    try:
+        yield
+    finally:
+        torch.set_deterministic_debug_mode(before)
+
+
 class Trainer:
     """Trains Gaussians on pictures, step by step.
 
     On CUDA nothing in a step waits for the device, but one step in 100, and those that change the number of Gaussians.
-    The same seed gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
+    The same seed gives the same bits (on CUDA see `deterministic` of the options); so does a training that goes on from
+    `state_dict`, in another process as well.
 
     Args:
         options: Of the training.
@@ -64,7 +81,7 @@ class Trainer:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
-        last: Picture and target (`Pictures.target`) of the last step, for looking at.
+        last: Picture and target (`Pictures.target`) of the last step, both black where nothing counts.
         dropped: Gaussians that were taken away because a number of theirs had left float32.
         warnings: Sentences for the user; who has told them empties the list.
     """
@@ -126,6 +143,10 @@ class Trainer:
             FloatingPointError: At a look, every 100 steps: most Gaussians have left float32.
             RuntimeError: There is no Gaussian any more, or none that a picture shows.
         """
+        with deterministic_mode() if self.options.deterministic else nullcontext():
+            self._step()
+
+    def _step(self) -> None:
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
@@ -206,7 +227,6 @@ class Trainer:
         """The pictures of the next step."""
         count, settings = self.options.pictures_per_step, self._settings()
         first = self.progress.step * count
-        effects = None if self.filter_3d is None else Effects(filter_3d=self.filter_3d)
         shown = []
         for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
@@ -214,8 +234,8 @@ class Trainer:
             if self.random_background:
                 background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
-            if effects is not None:
-                chosen = chosen._replace(effects=effects)
+            if self.filter_3d is not None:
+                chosen = chosen._replace(effects=replace(chosen.effects or Effects(), filter_3d=self.filter_3d))
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
@@ -240,11 +260,13 @@ class Trainer:
         gaussians, density = self.gaussians, self.density
         columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
+        mask = self.pictures.mask(shown.scale, shown.view)
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
             mean_columns=columns,
             target=truth,
             dL_dloss=self.one,
+            mask=mask,
             ssim_weight=self.options.ssim_weight,
             bg=shown.settings.bg,
             **self._camera(shown),
@@ -253,7 +275,7 @@ class Trainer:
             field.grad = gradient
         if columns:
             density.observe_gradients(gradients[-1], radii)
-        self.last = image, truth
+        self.last = counted(image, truth, mask)
         return loss, radii > 0 if self.options.sparse_adam else None
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
@@ -272,10 +294,10 @@ class Trainer:
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf() if self._watches(scale) else None
             image, radii = render(gaussians, settings, leaf, options.supersampling)
-            truth = self.pictures.target(scale, view, background)
-            losses.append(l1_ssim(image, truth, options.ssim_weight))
+            truth, mask = self.pictures.target(scale, view, background), self.pictures.mask(scale, view)
+            losses.append(l1_ssim(image, truth, options.ssim_weight, mask))
             seen.append((leaf, radii))
-            self.last = image.detach(), truth
+            self.last = counted(image.detach(), truth, mask)
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:

@@ -56,7 +56,9 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
         note(["sh_every"], "sh_degree is 0")
     if options.rates_half_life == 0:
         note(["rates_from"], "rates_half_life is 0, so that no rate falls")
-    if not options.seconds:
+    if options.seconds:
+        note(["deterministic"], "by the clock, every run has another number of steps")
+    else:
         _note_times(options, note)
     return reasons
 

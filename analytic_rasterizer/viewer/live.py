@@ -11,6 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -56,6 +57,8 @@ class _Client:
         colour = tuple(round(255 * channel) for channel in viewer.background)
         self.background = gui.add_rgb("Background", colour)
         self.view_name = gui.add_dropdown("View", [view.name for view in viewer.views])
+        hint = "Show the picture as the photograph of the view is, not that of a pinhole."
+        self.lens = gui.add_checkbox("Lens of the view", True, hint=hint, visible=viewer.has_lenses)
         self.steps = gui.add_button_group("Jump to", ["Previous", "Next", "Reset"])
         self.figures = gui.add_html("")
 
@@ -220,6 +223,11 @@ class LiveViewer:
         with self._changed:
             self._changed.wait_for(lambda: self._stopped)
 
+    @property
+    def has_lenses(self) -> bool:
+        """Whether a view has a lens, which browsers can switch off."""
+        return any(view.lens is not None for view in self.views)
+
     # ------------------------------------------------------------------------------- browsers
 
     def _begin(self, scene: Gaussians) -> None:
@@ -238,7 +246,7 @@ class LiveViewer:
             with self._changed:
                 self._ask(client)
 
-        for control in (client.footprint, client.resolution, client.background):
+        for control in (client.footprint, client.resolution, client.background, client.lens):
             control.on_update(ask)
         client.view_name.on_update(lambda _: self._jump(client))
         client.steps.on_click(lambda event: self._step_view(client, event.target.value))
@@ -286,7 +294,7 @@ class LiveViewer:
         with self._changed:
             if self._snapshot is None:
                 return
-        view = next(view for view in self.views if view.name == client.view_name.value)
+        view = self._chosen_view(client)
         _, down, forward = view.w2c[:3, :3]
         position = -view.w2c[:3, :3].T @ view.w2c[:3, 3]
         ahead = max(((self._middle - position) @ forward).item(), 0.1 * self._radius)
@@ -299,6 +307,9 @@ class LiveViewer:
             camera.look_at = (position + ahead * forward).numpy()
             camera.fov = 2 * math.atan(height / (2 * focal))
         self._move(client, camera)
+
+    def _chosen_view(self, client: _Client) -> io.View:
+        return next(view for view in self.views if view.name == client.view_name.value)
 
     def _show_status(self, client: _Client) -> None:
         with self._changed:
@@ -343,6 +354,8 @@ class LiveViewer:
                 client.due = client.moved + REST_AFTER  # the camera may rest then
         if snapshot is None:
             return  # the viewer has been stopped meanwhile
+        if client.lens.value:
+            view = replace(view, lens=self._chosen_view(client).lens)
         divisor = DIVISORS[client.resolution.value]
         scale = 1 / divisor
         if moving:

@@ -157,12 +157,16 @@ std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<doub
   const auto* p = reinterpret_cast<const Vec3<double>*>(read.const_data_ptr<double>());
   auto* u = reinterpret_cast<Vec2<double>*>(seen.mutable_data_ptr<double>());
   auto* j = reinterpret_cast<Vec3<double>*>(slopes.mutable_data_ptr<double>());
-  for (int64_t i = 0; i < n; ++i) {
-    u[i] = project_mean(camera, p[i]).pixel;
-    const Jacobian<double> rows = make_jacobian(camera, p[i]);
-    j[2 * i] = rows.x;
-    j[2 * i + 1] = rows.y;
-  }
+  const int64_t parts = cpu::chunks_of(n);
+  cpu::parallel_for(parts, thread_count(), [&](int64_t k) {
+    const cpu::Part part = cpu::part_of(n, parts, k);
+    for (int64_t i = part.begin; i < part.end; ++i) {
+      u[i] = project_mean(camera, p[i]).pixel;
+      const Jacobian<double> rows = make_jacobian(camera, p[i]);
+      j[2 * i] = rows.x;
+      j[2 * i + 1] = rows.y;
+    }
+  });
   return {seen, slopes};
 }
 

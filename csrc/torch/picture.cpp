@@ -34,26 +34,33 @@ Results picture_gradients(PictureArguments a) {
   const RasterizeArguments scene = scene_of(a, activate(parameters));
   const Results rendered = rasterize(scene);
   L1SsimArguments comparison;
-  comparison.image = rendered[0].toTensor();
+  const Tensor image = rendered[0].toTensor();
+  comparison.image = image;
   comparison.target = a.target;
+  if (a.mask) {  // as `counted` in losses.py
+    const bool levels = a.target.scalar_type() == at::kByte;
+    comparison.image = image.mul(*a.mask);
+    comparison.target = (levels ? a.target.to(image.scalar_type()).div(255) : a.target).mul(*a.mask);
+  }
   comparison.keep = true;
   comparison.l1_weight = 1 - a.ssim_weight;
   comparison.ssim_weight = -a.ssim_weight;
   comparison.constant = a.ssim_weight;
   const Results compared = l1_ssim(comparison);
 
-  const Results dL_dimage = l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}});
+  Tensor dL_dimage =
+      l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}})[0].toTensorVector()[0];
+  if (a.mask) dL_dimage = dL_dimage.mul(*a.mask);
   std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
   for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
   needs[1] = a.mean_columns > 0;
   const std::vector<Tensor> of_scene =
-      rasterize_vjp({{dL_dimage[0].toTensorVector()[0]}, scene, rendered[3].toTensorVector(), needs})[0]
-          .toTensorVector();
+      rasterize_vjp({{dL_dimage}, scene, rendered[3].toTensorVector(), needs})[0].toTensorVector();
   const std::vector<Tensor> of_parameters =
       activate_vjp({{of_scene[5], of_scene[6], of_scene[2]}, parameters, {}, {true, true, true}})[0].toTensorVector();
   std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
   if (needs[1]) gradients.push_back(of_scene[1]);
-  return {compared[0], comparison.image, rendered[2], gradients};
+  return {compared[0], image, rendered[2], gradients};
 }
 
 }  // namespace ar::ops
