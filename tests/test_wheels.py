@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import zipfile
 
 import pytest
 from conftest import ROOT
+
+from analytic_rasterizer.installation import wheel_folder
 
 
 def module_of(name):
@@ -173,3 +176,13 @@ def test_a_library_that_other_systems_lack_is_refused(tmp_path, compiler):
     wheel = wheel_of(tmp_path, compiler, "int b(); int f() { return b(); }", str(other))
     with pytest.raises(ValueError, match=r"needs libother\.so\.3, which other systems may not have"):
         platform_tag.platform_tag(wheel)
+
+
+def test_the_workflow_builds_what_its_folders_say():
+    text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text()
+    rows = re.findall(r'pair: (\w+), torch: ([\d.]+), index: (?:cpu|cu(\d+)(\d)), image: .*, cuda: "(\d)"', text)
+    assert len(rows) == 5
+    for folder, version, major, minor, cuda in rows:
+        assert folder == wheel_folder(version, f"{major}.{minor}" if major else None)
+        assert cuda == ("1" if major else "0")
+    assert f"pair: [{', '.join(sorted(row[0] for row in rows))}]" in text
