@@ -176,7 +176,7 @@ class Effects:
         far: Camera-space z from which on everything is culled.
         filter_3d: (P,) of `compute_3d_filter`: widens scales and lowers opacities (`apply_3d_filter`).
         lens: `Lens`, or None for a pinhole. Depths are then those of the model: z of `perspective` and `fov`, the
-            distance from the camera of the others, by which splats are ordered too.
+            distance from the camera of the others, by which splats are ordered too, and near and far are too.
         defocus: `Defocus`, or None for a pinhole.
         motion: `Motion`, or None for an instant.
         sh_degree: Highest degree of spherical harmonics to use, 0 to 4; None: that of the settings.

@@ -16,9 +16,18 @@ from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
+from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.health import flag
-from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
+from ..training.options import (
+    BACKGROUNDS,
+    DENSITIES,
+    DOWNSAMPLINGS,
+    PRESETS,
+    RANDOM_BACKGROUND,
+    TIMES,
+    preset_values,
+)
 from ..training.reports import process_age
 from .arguments import add_machine_options, port, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
@@ -235,6 +244,8 @@ def finish(training: Run, complete: bool, args) -> None:
         say(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
         for scale, values in metrics.get("test", {}).items():
             name = scale if scale == "mean" else f"1/{scale}"
-            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+            best = values.get(COLOR_CORRECTED)
+            after = "" if best is None else f"; after the best affine colour of each picture: PSNR {best:.2f} dB"
+            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}{after}")
     if training.ranks.is_first:
         print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in training.phases.items()), file=sys.stderr)

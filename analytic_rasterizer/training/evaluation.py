@@ -16,12 +16,14 @@ from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
 from ..losses import counted, ssim
 from ..settings import GaussianRasterizationSettings
+from .exposure import best_exposure, corrected
 from .model import render, render_together
 from .pictures import Pictures
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors
 MEASURES = ("psnr", "ssim", "lpips")
+COLOR_CORRECTED = "psnr_color_corrected"
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
@@ -74,6 +76,7 @@ def evaluate(
     lpips: Perceptual | None = None,
     *,
     supersampling: int = 1,
+    color_corrected: bool = False,
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> dict[str, dict]:
@@ -98,6 +101,7 @@ def evaluate(
     """
     if not pictures.views:
         raise ValueError("pictures must have at least one view, got none")
+    names = [*MEASURES[: 2 if lpips is None else 3], *([COLOR_CORRECTED] if color_corrected else [])]
     gaussians = scene.arguments()
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
@@ -108,10 +112,13 @@ def evaluate(
             values = [psnr(image, truth, mask), _mean_ssim(image, truth, mask)]
             if lpips is not None:
                 values.append(lpips(image, truth).reshape(()))
+            if color_corrected:
+                best = corrected(image, best_exposure(image, truth, mask))
+                values.append(psnr(best if mask is None else best * mask, truth, mask))
             measured[view] = torch.stack(values)
         own = dict(zip(measured, torch.stack(list(measured.values())).tolist() if measured else []))
         of_views = {view: values for of_rank in ranks.exchange(own) for view, values in of_rank.items()}
-        views = [dict(zip(MEASURES, of_views[view])) for view in range(len(settings))]
+        views = [dict(zip(names, of_views[view])) for view in range(len(settings))]
         results[str(scale)] = _means(views) | {"views": views}
     results["mean"] = _means([{k: v for k, v in of_scale.items() if k != "views"} for of_scale in results.values()])
     return results

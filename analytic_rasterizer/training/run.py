@@ -23,6 +23,7 @@ from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
     CHECKPOINT,
+    EXPOSURES,
     LOG,
     METRICS,
     MIP_SCENE,
@@ -124,6 +125,8 @@ class Run:
             stored = TrainingOptions.from_dict(state["options"])
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
+        if ranks.world > 1 and self.options.exposure != "none":
+            raise ValueError(f"exposure must be none for {ranks.world} processes, got {self.options.exposure}")
         # Where the scene is, from wherever `evaluate` is called.
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
         given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
@@ -273,6 +276,9 @@ class Run:
             scene = self._whole(self.trainer.scene(), SCENE)
             if self.ranks.is_first:
                 write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
+                if self.trainer.exposures is not None:
+                    names = [view.name for view in self.trainer.pictures.views]
+                    write_json(self.out / EXPOSURES, dict(zip(names, self.trainer.exposures.matrices.tolist())))
         self.save()
         if self.board is not None:
             self.board.close()
@@ -381,6 +387,7 @@ class Run:
                 background = background_of(self.options, self.capture.background) or self.capture.background
                 pictures = self._load(self.capture.test, background)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
+                common["color_corrected"] = self.options.exposure != "none"
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
         metrics["phases"] = self.ranks.from_first(phases)

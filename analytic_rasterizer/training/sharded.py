@@ -86,7 +86,7 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None]:
+    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None, dict[int, Tensor]]:
         """This rank's part of the loss, whose sum over the ranks is the loss of the step; and the rest as in `Trainer`.
 
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
@@ -119,7 +119,7 @@ class ShardedTrainer(Trainer):
             if self._watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
-        return loss, seen, rows
+        return loss, seen, rows, {}
 
     def _visible(self, shard: Sequence[OwnSplats]) -> Tensor:
         """Which Gaussians of this rank at least one of the pictures shows, (P,) bool. Waits for no device."""
