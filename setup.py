@@ -36,6 +36,31 @@ from torch.utils.cpp_extension import CUDA_HOME, BuildExtension, CppExtension, C
 ROOT = Path(__file__).parent
 
 
+def description_and_links() -> tuple[str, dict[str, str]]:
+    """README and the addresses of the project, by the variable `repository` of pyproject.toml.
+
+    Links of README to files of the repository become links to the address, or text where there is no address.
+    """
+    address = re.search(r'^repository = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.M)[1].rstrip("/")
+
+    def replaced(link: re.Match) -> str:
+        image, text, file = link.groups()
+        if not address:
+            return text
+        return f"{image}[{text}]({address}/{'raw' if image else 'blob'}/main/{file})"
+
+    readme = re.sub(r"(!?)\[([^\]]*)\]\((?!https?:|#)([^)]+)\)", replaced, (ROOT / "README.md").read_text())
+    names = {"Repository": "", "Issues": "/issues", "Changelog": "/blob/main/CHANGELOG.md"}
+    return readme, {name: address + path for name, path in names.items() if address}
+
+
+def torch_requirement() -> str:
+    """An extension fits the minor version of torch that it is built with. Sources can be built with many."""
+    if "sdist" in sys.argv:
+        return "torch>=2.4"
+    return f"torch=={'.'.join(torch.__version__.split('.')[:2])}.*"
+
+
 def wants_cuda() -> bool:
     choice = os.environ.get("ANALYTIC_RASTERIZER_CUDA", "")
     if choice not in ("", "0", "1"):
@@ -127,7 +152,13 @@ class Build(BuildExtension):
         super().build_extensions()
 
 
+README, LINKS = description_and_links()
+
 setup(
+    install_requires=[torch_requirement(), "numpy"],
+    long_description=README,
+    long_description_content_type="text/markdown",
+    project_urls=LINKS,
     ext_modules=[
         (CUDAExtension if WITH_CUDA else CppExtension)(
             "analytic_rasterizer._C",

@@ -45,7 +45,7 @@ from .settings import GaussianRasterizationSettings
 from .sh import needed_sh_degree
 from .stages import Splats, Stages, TileLists, blend, list_tiles, project, render_stages
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "FOOTPRINTS",

@@ -11,6 +11,7 @@ from .checks import check_tensors
 from .effects import MAX_SH_DEGREE, Effects
 from .filters import apply_3d_filter
 from .footprints import check_device
+from .seam import has_seam
 from .settings import GaussianRasterizationSettings, check_settings, one_number, whole_number
 from .sh import used_sh_degree
 
@@ -52,18 +53,28 @@ def gaussian_arguments(
 
 
 def camera_arguments(
-    settings: GaussianRasterizationSettings, means3D: torch.Tensor, shs: torch.Tensor | None, full: bool = False
+    settings: GaussianRasterizationSettings,
+    means3D: torch.Tensor,
+    shs: torch.Tensor | None,
+    full: bool = False,
+    with_seam: bool = False,
 ) -> dict[str, Any]:
     """The camera, the degree of the harmonics and the footprint by the names of the ops.
 
     A plain camera, which is all that 3DGS has, comes without a `lens`; `full` asks for one all the same. A matrix, a
-    camera centre or a tangent that requires a gradient makes a full camera too, for only that has one.
+    camera centre or a tangent that requires a gradient makes a full camera too, for only that has one. `with_seam`:
+    the caller shows what lies across the seam of an equirectangular picture at both borders (seam.py); others refuse
+    this lens.
 
     Raises:
         TypeError, ValueError: A matrix is no tensor or on another device; the size or the degree is no whole number; a
-            tangent or the scale modifier is no number; the scale modifier requires a gradient.
+            tangent or the scale modifier is no number; the scale modifier requires a gradient; an equirectangular lens.
     """
     s, effects = settings, settings.effects
+    if has_seam(s) and not with_seam:
+        raise ValueError(
+            "lens must not be equirectangular here, got one: GaussianRasterizer and project, list_tiles, blend have it"
+        )
     if isinstance(s.scale_modifier, torch.Tensor) and s.scale_modifier.requires_grad and torch.is_grad_enabled():
         raise ValueError(
             "scale_modifier must not require a gradient, it gets none: multiply the scales by it, or pass "

@@ -86,7 +86,7 @@ def camera_settings(
     center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1])
     projection, position = camera_matrices(view, scale, center, orthographic)
     if isinstance(effects, Effects) and effects.lens is not None:
-        effects = replace(effects, lens=effects.lens.with_reach(tangents, -center / scale))
+        effects = replace(effects, lens=effects.lens.with_reach(tangents, -center / scale, height))
     # Numbers, unless their gradient may be asked for: reading them later makes the host wait for the device.
     asked_for = isinstance(effects, Effects) and effects.camera_gradients
     if not (asked_for or any(t.requires_grad for t in tangents)):
@@ -188,7 +188,8 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
     if effects.off_center or effects.lens is not None:
         center = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
     if effects.lens is not None:
-        effects = replace(effects, lens=effects.lens.with_reach(tangents, center))
+        height = whole_number("image_height", settings.image_height)
+        effects = replace(effects, lens=effects.lens.with_reach(tangents, center, height))
     like, members = widened(like), effects.lens_members()
     members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
     if effects.off_center or effects.lens is not None:

@@ -169,14 +169,14 @@ class Effects:
             `camera_settings` derives them from a pose and fx, fy, cx, cy.
         orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
             units, and projmatrix must leave w at 1.
-        off_center: Centre the clamp of x/z and y/z in the projection of covariances on the principal point of
+        off_center: Centre the clamp of x/z and y/z in the projection of covariances on the middle of the picture, by
             projmatrix. Without it the clamp is that of 3DGS, around the optical axis: right unless an edge of the
             picture is more than 1.3 half pictures away from the axis, as in a crop.
         near: Camera-space z up to which everything is culled, world units.
         far: Camera-space z from which on everything is culled.
         filter_3d: (P,) of `compute_3d_filter`: widens scales and lowers opacities (`apply_3d_filter`).
         lens: `Lens`, or None for a pinhole. Depths are then those of the model: z of `perspective` and `fov`, the
-            distance from the camera of the others, by which splats are ordered too.
+            distance from the camera of the others, by which splats are ordered too, and near and far are too.
         defocus: `Defocus`, or None for a pinhole.
         motion: `Motion`, or None for an instant.
         sh_degree: Highest degree of spherical harmonics to use, 0 to 4; None: that of the settings.

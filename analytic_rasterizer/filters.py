@@ -22,6 +22,7 @@ from .footprints import DILATED, resolve_footprint
 from .lens import WIDE
 from .outputs import depths
 from .rotations import rotation_matrices
+from .seam import has_seam
 from .settings import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
@@ -94,6 +95,8 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     `camera` is a `GaussianRasterizationSettings`.
     """
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
+    if has_seam(camera):
+        raise ValueError("cameras must have no equirectangular lens, whose sampling interval is not known, got one")
     if effects.lens is not None:
         return _interval_of_lens(means3D, camera, effects)
     clip = camera.projmatrix.reshape(4, 4).to(means3D)

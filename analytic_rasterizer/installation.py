@@ -1,7 +1,7 @@
-"""What can be wrong with an installation, in sentences that say how to mend it.
+"""Which wheel fits a torch, and what can be wrong with an installation, in sentences that say how to mend it.
 
-The compiled extension may be missing, or may have been built for another torch. And another distribution may have put
-its module in the place of ours, diff_gaussian_rasterization.
+The compiled extension may be missing, or may have been built for another torch. And another distribution may have
+replaced our module diff_gaussian_rasterization with its own.
 """
 
 from __future__ import annotations
@@ -19,6 +19,44 @@ import torch
 
 _INSTALL_AGAIN = "`pip install --force-reinstall --no-deps path/to/analytic_rasterizer`"
 _BUILT_FOR = "analytic_rasterizer was built for torch "  # with the version behind it, in the file of the extension
+
+
+def wheel_folder(torch_version: str, cuda: str | None) -> str:
+    """The folder of the wheels for a torch, by its minor version and that of CUDA: pt213cpu, pt211cu130.
+
+    Args:
+        torch_version: As in `torch.__version__`, such as 2.13.0+cpu.
+        cuda: As in `torch.version.cuda`, such as 13.0; None for a torch or a build without CUDA.
+    """
+    major, minor = torch_version.split(".")[:2]
+    return f"pt{major}{minor}" + (f"cu{cuda.replace('.', '')}" if cuda else "cpu")
+
+
+def _way_out() -> str:
+    fitting = wheel_folder(torch.__version__, torch.version.cuda)
+    return f"install the wheel of {fitting} (docs/install.md), or build it for this torch, {_INSTALL_AGAIN}"
+
+
+def about(version: str, built_for: str, has_cuda: bool) -> str:
+    """Lines that say what is installed, and which wheels fit the torch that is there.
+
+    Args:
+        version: Of this package.
+        built_for: What the extension says, `_C.BUILT_FOR`.
+        has_cuda: Whether the extension has the CUDA path, `_C.has_cuda`.
+    """
+    cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "no CUDA"
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU is visible"
+    fitting = wheel_folder(torch.__version__, torch.version.cuda)
+    return "\n".join(
+        (
+            f"analytic_rasterizer {version}, built for torch {built_for.removeprefix(_BUILT_FOR)}, "
+            f"for {'the CPU and CUDA' if has_cuda else 'the CPU'}",
+            f"torch {torch.__version__} with {cuda}, Python {platform.python_version()}, {device}",
+            "the wheels that fit this torch, where INDEX is the folder or the address of the wheels:",
+            f"    pip install --index-url INDEX/{fitting} analytic-rasterizer",
+        )
+    )
 
 
 def _extensions_in(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -41,7 +79,7 @@ def why_not_loaded(error: ImportError) -> str:
         )
     return (
         f"analytic_rasterizer was built for torch {found[1].decode()} and cannot be loaded with torch "
-        f"{torch.__version__}, which is installed now ({error}): build it for this one, {_INSTALL_AGAIN}"
+        f"{torch.__version__}, which is installed now ({error}): {_way_out()}"
     )
 
 
@@ -67,8 +105,7 @@ def warn_if_built_for_another(built_for: str) -> None:
     built, there = (version.split(".")[:2] for version in (built_for.removeprefix(_BUILT_FOR), torch.__version__))
     if built != there:
         warnings.warn(
-            f"{built_for}, and torch {torch.__version__} is installed, so that calls may crash: build it for this one, "
-            f"{_INSTALL_AGAIN}",
+            f"{built_for}, and torch {torch.__version__} is installed, so that calls may crash: {_way_out()}",
             stacklevel=3,
         )
 

@@ -19,8 +19,9 @@ _PARTS = {
     "fisheye": ((4, 0), (2, 6), (4, 8)),
     "rad_tan_fisheye": ((6, 0), (2, 6), (4, 8)),
 }
-MODELS = (*_PARTS, "fov")
-WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis
+SPHERE = "equirectangular"
+MODELS = (*_PARTS, "fov", SPHERE)
+WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis, about the axis
 _DIRECTIONS, _ANGLES = 64, 512  # of the rays with which limits are found
 _NEWTON_STEPS, _LONGEST_STEP = 30, 0.2  # rad
 _WIDEST_PERSPECTIVE = math.radians(89.5)
@@ -34,12 +35,13 @@ class Lens:
     covariance through its exact Jacobian there. Gaussians beyond the angle at which the map folds back are culled.
 
     Attributes:
-        model: One of `perspective`, `fisheye`, `rad_tan_fisheye`, `fov`.
+        model: One of `perspective`, `fisheye`, `rad_tan_fisheye`, `fov`, `equirectangular`.
         coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable, whose values
-            the host reads for every picture.
+            the host reads for every picture. `equirectangular` has none.
         reach: Angle from the axis, rad, beyond which the Jacobian is that of a ray at this angle; None: 1.3 times the
             largest (of its tangent, for `perspective` and `fov`) that the picture sees. To find that, the host waits
-            for a CUDA device, unless `camera_settings` made the settings.
+            for a CUDA device, unless `camera_settings` made the settings. Of `equirectangular` it is a latitude, below
+            pi/2; None: half a pixel from the poles, as far as the nearest row of pixel centres.
 
     Raises:
         TypeError: Coefficients are no numbers.
@@ -62,8 +64,12 @@ class Lens:
             object.__setattr__(self, "coefficients", numbers + (0.0,) * (SIZE - len(numbers)))
             if self.model == "fov" and not 0 < self.coefficients[0] < math.pi:
                 raise ValueError(f"w of a fov lens must be above 0 and below pi, got {self.coefficients[0]}")
+        if self.model == SPHERE and (isinstance(given, torch.Tensor) or any(self.coefficients)):
+            raise ValueError(f"coefficients of an equirectangular lens must be zero, got {given}")
         if self.reach is not None and not 0 < self.reach <= math.pi:
             raise ValueError(f"reach must be above 0 and at most pi, got {self.reach}")
+        if self.model == SPHERE and self.reach is not None and not self.reach < math.pi / 2:
+            raise ValueError(f"reach of an equirectangular lens must be below pi/2, got {self.reach}")
 
     @classmethod
     def perspective(cls, radial=(), tangential=(), thin_prism=()) -> Lens:
@@ -116,6 +122,20 @@ class Lens:
         """
         return cls("fov", (w,))
 
+    @classmethod
+    def equirectangular(cls) -> Lens:
+        """The sphere, or a part of it: columns are longitudes atan2(x, z), rows are latitudes asin(y / |p|).
+
+        A picture of w x h px shows the whole sphere with fx = w / (2 pi) and fy = h / pi. Its left and right borders
+        are the same seam: what lies across one shows at both.
+        """
+        return cls(SPHERE, ())
+
+    @property
+    def orders_by_distance(self) -> bool:
+        """Whether depths are distances from the camera, and not camera-space z."""
+        return self.model in (*WIDE, SPHERE)
+
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where the lens shows points, in units of the focal lengths, from the principal point. Waits for a device.
 
@@ -138,7 +158,9 @@ class Lens:
         return positions, derivatives
 
     def unproject(self, positions: torch.Tensor) -> torch.Tensor:
-        """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2), by Newton's method.
+        """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2).
+
+        By Newton's method, but for `equirectangular`, which has a formula.
 
         Units as of `project`; float64, on the CPU. NaN where no direction is found.
 
@@ -146,6 +168,10 @@ class Lens:
             TypeError, ValueError: Positions as the points of `project`.
         """
         positions = _rows("positions", positions, 2)
+        if self.model == SPHERE:
+            longitude, latitude = positions.unbind(1)
+            across = torch.where(latitude.abs() <= math.pi / 2, latitude.cos(), math.nan)
+            return torch.stack([across * longitude.sin(), latitude.sin() + 0 * across, across * longitude.cos()], 1)
         # The unknown is the angle from the axis times the unit vector across it. `start` has the angle that the lens
         # shows at this distance along x.
         angles = torch.linspace(0, self.fold, 8 * _ANGLES, dtype=torch.float64)
@@ -166,15 +192,19 @@ class Lens:
         wrong = ~((seen - positions).norm(dim=1) <= 1e-9 * (1 + distance))
         return torch.where(wrong[:, None], math.nan, rays)
 
-    def with_reach(self, tangents: Sequence[float], center: Sequence[float]) -> Lens:
+    def with_reach(self, tangents: Sequence[float], center: Sequence[float], height: int | None = None) -> Lens:
         """The same with `reach` for a picture, unless it has one.
 
         Args:
             tangents: tanfovx and tanfovy of the settings; numbers or tensors.
             center: x/z and y/z of a pinhole at the middle of the picture; numbers or tensors.
+            height: Of the picture, px; `equirectangular` needs it.
         """
         if self.reach is not None:
             return self
+        if self.model == SPHERE:  # a pixel is 2 tanfovy / height radians high
+            tangent = tangents[1].item() if isinstance(tangents[1], torch.Tensor) else float(tangents[1])
+            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(tangent / height, 1.5))
         numbers = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
         reach = _reach(self.model, self.numbers(), *numbers)
         return Lens(self.model, self.coefficients, reach)
@@ -186,6 +216,8 @@ class Lens:
 
     def members(self) -> dict:
         """The entries of the operator's argument `lens`, by the names of `_C.LENS`."""
+        if self.model == SPHERE:
+            return {"model": float(_C.CAMERA_MODELS.index(SPHERE)), "reach": 1 / math.cos(self.reach)}
         measure = (lambda angle: angle) if self.model in WIDE else (lambda angle: math.tan(min(angle, 1.57)))
         return {
             "model": float(_C.CAMERA_MODELS.index(self.model)),
@@ -270,6 +302,8 @@ def _end(model: str) -> float:
 
 @lru_cache(maxsize=4096)
 def _fold(model: str, coefficients: tuple[float, ...]) -> float:
+    if model == SPHERE:
+        return math.pi
     first, last = 0.0, _end(model)
     for _ in range(2):  # the second time between two neighbours of the first
         angles = torch.linspace(first, last, _ANGLES + 1, dtype=torch.float64)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from . import ops  # noqa: F401  (registers the fake kernels)
+from .checks import check_tensors
 from .footprints import check_device
 
 __all__ = ["l1_ssim", "ssim"]
@@ -18,7 +19,9 @@ __all__ = ["l1_ssim", "ssim"]
 REDUCTIONS = ("mean", "none")
 
 
-def l1_ssim(image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2) -> torch.Tensor:
+def l1_ssim(
+    image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2, mask: torch.Tensor | None = None
+) -> torch.Tensor:
     """(1 - ssim_weight) * mean |image - target| + ssim_weight * (1 - mean similarity), the training loss of 3DGS.
 
     The similarity is that of `ssim`. The derivative of |x| at 0 is taken as 0. NaN in the images makes the loss NaN.
@@ -30,6 +33,9 @@ def l1_ssim(image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2)
         target: Of the same shape and device, of the dtype of image, or uint8, which is read as target / 255. It has no
             gradient.
         ssim_weight: In [0, 1].
+        mask: (H, W) of the dtype and device of image, in [0, 1]: the share of each pixel that counts. Both images are
+            multiplied by it, so that a pixel of 0 has no gradient, whatever the images are there. The mean is still
+            over all pixels. None: all of them count.
 
     Returns:
         () of the dtype of image, differentiable once with respect to image. For the backward pass three numbers per
@@ -49,7 +55,22 @@ def l1_ssim(image: torch.Tensor, target: torch.Tensor, ssim_weight: float = 0.2)
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must be in [0, 1], got {ssim_weight}")
     weight = float(ssim_weight)
+    image, target = counted(image, target, mask)
     return torch.ops.analytic_rasterizer.l1_ssim(image, target, 1 - weight, -weight, weight)[0]
+
+
+def counted(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Both images times the mask, see `l1_ssim`; without a mask as they are."""
+    if mask is None:
+        return image, target
+    check_tensors(image.device, mask=mask)
+    if mask.dtype != image.dtype:
+        raise TypeError(f"mask must have the dtype of image, {image.dtype}, got {mask.dtype}")
+    if mask.shape != image.shape[-2:]:
+        raise ValueError(f"mask must have shape (H, W) = {tuple(image.shape[-2:])}, got {tuple(mask.shape)}")
+    if not target.is_floating_point():
+        target = target.to(image.dtype) / 255
+    return image * mask, target * mask
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor, reduction: str = "mean") -> torch.Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from . import _C
@@ -24,11 +26,20 @@ def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-
     return torch.where(seen, blended / torch.where(seen, alpha, 1), 0)
 
 
-def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
-    """Camera-space z (P,), world units, of means3D (P, 3) under `view`, the (4, 4) viewmatrix of 3DGS (transposed)."""
+def depths(means3D: torch.Tensor, view: torch.Tensor, effects: Any = None) -> torch.Tensor:
+    """Depths (P,), world units, of means3D (P, 3) under `view`, the (4, 4) viewmatrix of 3DGS (transposed).
+
+    They are camera-space z, or with `effects` whose lens orders by it the distance from the camera.
+    """
     means3D, view = widened(means3D), widened(view).reshape(4, 4)
     x, y, z = means3D.unbind(1)  # not `@`, which autocast and TF32 round
-    return x * view[0, 2] + y * view[1, 2] + z * view[2, 2] + view[3, 2]
+
+    def along(axis: int) -> torch.Tensor:
+        return x * view[0, axis] + y * view[1, axis] + z * view[2, axis] + view[3, axis]
+
+    if isinstance(effects, Effects) and effects.lens is not None and effects.lens.orders_by_distance:
+        return torch.stack([along(axis) for axis in range(3)]).norm(dim=0)
+    return along(2)
 
 
 def split_background(

@@ -21,7 +21,9 @@ from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import NEAR, Effects, Outputs
 from .outputs import before_background, depths, split_background, summaries
+from .seam import has_seam
 from .settings import GaussianRasterizationSettings
+from .sphere import render_sphere
 
 NOTHING = Effects()
 """Asks for no output."""
@@ -92,6 +94,9 @@ def render(
 
     The other arguments, what is returned, and errors are those of `GaussianRasterizer.forward`.
     """
+    if has_seam(settings):
+        given = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, features
+        return render_sphere(settings, outputs, *given)
     gaussians = gaussian_arguments(
         settings,
         means3D,
@@ -139,7 +144,7 @@ def _render_with_outputs(
     if not effects.has_outputs:
         return color, radii
     if with_summaries:
-        z = depths(gaussians["means3D"].detach(), camera["viewmatrix"].detach())
+        z = depths(gaussians["means3D"].detach(), camera["viewmatrix"].detach(), settings.effects)
         outputs |= summaries(effects, saved, z, size, camera["footprint"], camera["option"])
     return color, radii, Outputs(**outputs)
 
@@ -156,7 +161,9 @@ class GaussianRasterizer(torch.nn.Module):
         self.raster_settings = raster_settings
 
     def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
-        """Which positions lie beyond the near plane: camera-space z above 0.2, or above `Effects.near` if that is set.
+        """Which positions lie beyond the near plane: depth above 0.2, or above `Effects.near` if that is set.
+
+        The depth is camera-space z; with a fisheye or an equirectangular lens it is the distance from the camera.
 
         Args:
             positions: (P, 3) world units.
@@ -184,7 +191,7 @@ class GaussianRasterizer(torch.nn.Module):
         effects = getattr(self.raster_settings, "effects", None)  # settings of a class of the program have none
         near = effects.near if isinstance(effects, Effects) else NEAR
         with torch.no_grad():
-            return depths(positions, view) > near
+            return depths(positions, view, effects) > near
 
     def forward(
         self,

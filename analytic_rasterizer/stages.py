@@ -25,12 +25,16 @@ from .arguments import camera_arguments, gaussian_arguments
 from .checks import check_tensors
 from .effects import Effects
 from .outputs import before_background, depths, split_background
+from .seam import turns_of, with_copies
 from .settings import GaussianRasterizationSettings, check_settings
 
 
 @dataclass(frozen=True)
 class Splats:
     """Projected Gaussians: a row for every Gaussian that a camera may see, camera after camera, Gaussians ascending.
+
+    In an equirectangular picture a Gaussian has a row for every place at which it may show: two at the seam, up to
+    six near a pole.
 
     N is the number of rows, C that of cameras. The first five members are differentiable in what `project` was given.
 
@@ -40,7 +44,7 @@ class Splats:
             with respect to it include those through the determinant; that of xy is with respect to the one number that
             fills both off-diagonal places.
         opacities: (N,) multiplied by the amplitude of defocus and motion blur.
-        depths: (N,) camera-space z, world units.
+        depths: (N,) camera-space z, or with some lenses the distance from the camera (`Effects.lens`), world units.
         colors: (N, 3) RGB where `project` had shs or colors_precomp, else (0, 3).
         radii: (N,) int32, px, as `GaussianRasterizer` returns; positive.
         gaussian_ids: (N,) int32, the row of each splat's Gaussian in what `project` was given.
@@ -168,7 +172,7 @@ def project(
     cameras = list(settings) if several else [settings]
     if not cameras:
         raise ValueError("settings must hold at least one camera, got none")
-    gaussians, batch = project_arguments(
+    splats, turns = project_once(
         cameras,
         means3D,
         opacities,
@@ -178,8 +182,17 @@ def project(
         rotations=rotations,
         cov3D_precomp=cov3D_precomp,
     )
+    return splats if turns is None else with_copies(splats, turns)[0]
+
+
+def project_once(
+    cameras: Sequence[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **optional: Any
+) -> tuple[Splats, torch.Tensor | None]:
+    """As `project`, with one row for a Gaussian in a camera, and what `turns_of` returns."""
+    gaussians, batch = project_arguments(cameras, means3D, opacities, **optional)
+    turns = turns_of(cameras, means3D)
     *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch)
-    return Splats(
+    splats = Splats(
         **dict(zip(_ROWS, rows)),
         dets=saved[0],
         width=batch["image_width"],
@@ -187,6 +200,7 @@ def project(
         footprint=batch["footprint"],
         option=batch["option"],
     )
+    return splats, turns
 
 
 def project_arguments(
@@ -204,9 +218,9 @@ def project_arguments(
             raise ValueError(f"settings must agree in filter_3d, but camera {number} has another one than camera 0")
     gaussians = gaussian_arguments(cameras[0], means3D, opacities, **optional)
     shs = optional["shs"]
-    arguments = [camera_arguments(camera, means3D, shs) for camera in cameras]
+    arguments = [camera_arguments(camera, means3D, shs, with_seam=True) for camera in cameras]
     if any(a["lens"] is not None for a in arguments):
-        arguments = [camera_arguments(camera, means3D, shs, full=True) for camera in cameras]
+        arguments = [camera_arguments(camera, means3D, shs, full=True, with_seam=True) for camera in cameras]
     common = ("image_height", "image_width", "scale_modifier", "sh_degree", "footprint", "option")
     shared = {name: arguments[0][name] for name in common}
     for number, a in enumerate(arguments):
@@ -386,7 +400,7 @@ def render_stages(
         ids = kept.nonzero()[:, 0].int()
         places = kept.cumsum(0) - 1
         splats, pairs = splats[kept], places[pairs[: lists["tile_offsets"][-1], 0].long()].int()
-    z = depths(means3D, settings.viewmatrix)[ids.long()]
+    z = depths(means3D, settings.viewmatrix, settings.effects)[ids.long()]
     times = dict(zip(("project", "list_tiles", "blend"), seconds.tolist()))
     means2d = splats[:, :2].clone()
     return Stages(color, radii, ids, z, means2d, pairs, lists["tile_offsets"], times)

@@ -53,7 +53,7 @@ class Variant:
     central_order: bool = True
     alpha_min: float = _C.ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
-    projection: str = "affine"  # or "maximum", "integral"
+    projection: str = "affine"  # or "maximum", "integral", "ahead"
 
 
 VARIANTS = {
@@ -94,9 +94,15 @@ class Splats:
         axes = turn @ rotation_matrices(scene.rotations[ids])
         self.whiten = axes.mT / scene.scales[ids][:, :, None]
         self.centre = scene.means[ids] @ turn.T + shift
+        middle = [n / 2 if c is None else c for c, n in ((view.cx, view.width), (view.cy, view.height))]
+        self.focal, self.principal = torch.tensor([[view.fx, view.fy], middle], dtype=torch.float64)
 
     def __len__(self) -> int:
         return len(self.opacity)
+
+    def rays(self, pixels: torch.Tensor) -> torch.Tensor:
+        """(M, 3) directions in camera space, z = 1, of what is seen at `pixels` (M, 2)."""
+        return torch.cat([(pixels + 0.5 - self.principal) / self.focal, torch.ones_like(pixels[:, :1])], 1)
 
     def near(self, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
         """Indices of the splats that may reach the rectangle from `low` to `high` (2,), px."""
@@ -114,7 +120,8 @@ def affine_alphas(s: Splats, ids: torch.Tensor, pixels: torch.Tensor) -> torch.T
 def alphas_and_depths(s: Splats, ids: torch.Tensor, rays: torch.Tensor, projection: str):
     """(M, N) alpha in space, not bounded by 0.99, and the depth at which each ray meets each splat.
 
-    `rays` (M, 3) are directions in camera space with z = 1.
+    `rays` (M, 3) are directions in camera space. Depths are in units of their lengths. What a ray meets behind the
+    camera has no alpha, except that `projection` "ahead" is the largest density from the camera on.
     """
     ray = [sum(s.whiten[ids, i, k] * rays[:, k, None] for k in range(3)) for i in range(3)]
     centre = (s.whiten[ids] @ s.centre[ids, :, None])[..., 0].unbind(1)
@@ -128,7 +135,10 @@ def alphas_and_depths(s: Splats, ids: torch.Tensor, rays: torch.Tensor, projecti
         # Along a direction v the Gaussian has the standard deviation |v| / |whiten v|.
         across = s.centre[ids].norm(dim=1) / torch.stack(centre, 1).norm(dim=1)
         alpha = alpha * rays.norm(dim=1, keepdim=True) / square.sqrt() / across
-    return torch.where(depth > 0, alpha, 0), depth
+    behind = 0.0
+    if projection == "ahead":
+        behind = s.opacity[ids] * torch.exp(-sum(c * c for c in centre) / 2)
+    return torch.where(depth > 0, alpha, behind), depth
 
 
 def weights(alpha: torch.Tensor, variant: Variant) -> torch.Tensor:
@@ -139,12 +149,12 @@ def weights(alpha: torch.Tensor, variant: Variant) -> torch.Tensor:
     return torch.where(behind < variant.transmittance_min, 0, front * alpha)
 
 
-def sample(s: Splats, ids: torch.Tensor, rays: torch.Tensor, pixels: torch.Tensor, variant: Variant) -> torch.Tensor:
-    """(M, 3) colours of samples, over black."""
+def sample(s: Splats, ids: torch.Tensor, pixels: torch.Tensor, variant: Variant) -> torch.Tensor:
+    """(M, 3) colours of samples at `pixels` (M, 2), over black."""
     if variant.projection == "affine":
         alpha = affine_alphas(s, ids, pixels)
     if variant.projection != "affine" or not variant.central_order:
-        in_space, depth = alphas_and_depths(s, ids, rays, variant.projection)
+        in_space, depth = alphas_and_depths(s, ids, s.rays(pixels), variant.projection)
         alpha = alpha if variant.projection == "affine" else in_space
     if variant.central_order:
         return weights(alpha, variant) @ s.color[ids]
@@ -153,25 +163,24 @@ def sample(s: Splats, ids: torch.Tensor, rays: torch.Tensor, pixels: torch.Tenso
     return torch.empty_like(alpha).scatter_(1, order, sorted_weights) @ s.color[ids]
 
 
-def render(s: Splats, view: io.View, corner: tuple[int, int], size: tuple[int, int], samples: int, variant: Variant):
+def render(
+    s: Splats, corner: tuple[int, int], size: tuple[int, int], samples: int, variant: Variant, block: int = BLOCK
+) -> torch.Tensor:
     """(3, height, width) of the rectangle of `size` (width, height) whose first pixel is `corner`."""
     width, height = size
-    centre = [n / 2 if c is None else c for c, n in ((view.cx, view.width), (view.cy, view.height))]
-    focal, principal = torch.tensor([[view.fx, view.fy], centre], dtype=torch.float64)
     grid = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
     image = torch.zeros(height, width, 3, dtype=torch.float64)
-    for y in range(0, height, BLOCK):
-        for x in range(0, width, BLOCK):
-            w, h = min(BLOCK, width - x), min(BLOCK, height - y)
+    for y in range(0, height, block):
+        for x in range(0, width, block):
+            w, h = min(block, width - x), min(block, height - y)
             low = torch.tensor([corner[0] + x, corner[1] + y], dtype=torch.float64)
             ids = s.near(low - 0.5, low + torch.tensor([w, h]) - 0.5)
             columns, rows = ((torch.arange(n)[:, None] + grid).flatten() for n in (w, h))
             pixels = low + torch.cartesian_prod(rows, columns).flip(1)
-            rays = torch.cat([(pixels + 0.5 - principal) / focal, torch.ones(len(pixels), 1, dtype=torch.float64)], 1)
-            parts = zip(*(part.split(max(1, ELEMENTS // max(1, len(ids)))) for part in (rays, pixels)))
-            colors = [sample(s, ids, *part, variant) for part in parts]
-            block = torch.cat(colors).view(h, samples, w, samples, 3)
-            image[y : y + h, x : x + w] = block.mean((1, 3))
+            parts = pixels.split(max(1, ELEMENTS // max(1, len(ids))))
+            colors = [sample(s, ids, part, variant) for part in parts]
+            fine = torch.cat(colors).view(h, samples, w, samples, 3)
+            image[y : y + h, x : x + w] = fine.mean((1, 3))
     return image.permute(2, 0, 1)
 
 
@@ -180,10 +189,10 @@ def measure(scene: Gaussians, view: io.View, size: tuple[int, int], samples: int
     size = min(size[0], view.width), min(size[1], view.height)
     corner = (view.width - size[0]) // 2, (view.height - size[1]) // 2
     splats = Splats(scene, view)
-    first = render(splats, view, corner, size, samples, Variant())
+    first = render(splats, corner, size, samples, Variant())
     own = supersampled(scene, view, samples)[:, corner[1] :, corner[0] :][:, : size[1], : size[0]]
     pictures = {"library": own}
-    pictures |= {name: render(splats, view, corner, size, samples, variant) for name, variant in VARIANTS.items()}
+    pictures |= {name: render(splats, corner, size, samples, variant) for name, variant in VARIANTS.items()}
     return {name: image_errors(picture, first)["psnr"] for name, picture in pictures.items()}
 
 

@@ -179,7 +179,7 @@ def main() -> None:
         train = [(view, renderer.photograph(view, rays_of(view, inverse)), members) for view in trained]
         write_capture(args.out / name, train, test, points, colors)
     results: dict[str, list[float]] = {}
-    for name, lens in (("pinhole", "exact"), ("opencv", "exact"), ("opencv", "undistort"), ("fisheye", "exact")):
+    for name, lens in (("pinhole", "keep"), ("opencv", "keep"), ("opencv", "undistort"), ("fisheye", "keep")):
         for seed in args.seeds:
             options = training.TrainingOptions(
                 iterations=args.iterations, footprint=args.footprint, seed=seed, background=args.background

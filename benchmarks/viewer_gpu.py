@@ -1,11 +1,12 @@
-"""What a frame of the viewer's page costs on a graphics device, without a browser: the page's own shaders under OpenGL.
+"""What a frame of the viewer's page costs with WebGL 2, without a browser: the page's own shaders under OpenGL.
 
     pip install moderngl
     python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
 
-The sources of the shaders, their constants and the table of `analytic` are taken from the modules of the page, which
-node runs; what is around them is drawn as project.js and draw.js do it, with the same textures, geometry and blending.
-Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it comes from EGL and needs no window.
+The sources of the shaders and their constants are taken from the modules of the page, which node runs. What is around
+them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and blending. Footprints are
+those of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00. On Linux
+it comes from EGL and needs no window.
 
 Each picture of the first size, blended in 32-bit floats (as when the camera rests) and in half floats (as when it
 moves), is compared with that of the CPU rasterizer. Frames are then timed in half floats, footprints in turn, round
@@ -36,32 +37,26 @@ from pathlib import Path
 
 import numpy as np
 
-MODULES = ("constants.js", "logistic.js", "shaders.js")
+MODULES = ("constants.js", "sh.js", "webgl_shaders.js")
 EXTRACT = """
 import { readFileSync } from 'fs';
-import { CONSTANTS, nodesOf } from './constants.js';
-import { windowTable } from './logistic.js';
+import { CONSTANTS } from './constants.js';
 import {
-  ADD, FULL_SCREEN, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
+  FULL_SCREEN, GL_KINDS, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
   texelsOfHarmonics,
-} from './shaders.js';
+} from './webgl_shaders.js';
 
 const DEGREES = [0, 1, 2, 3];
 const footprints = {}, projections = {};
 for (const { name, kind, samples, variance } of JSON.parse(readFileSync('footprints.json', 'utf8'))) {
-  const nodes = nodesOf(samples);
-  const passes = atOnce => Array.from({ length: Math.ceil(nodes.length / atOnce) },
-    (_, k) => drawFragmentShader(kind, nodes.slice(k * atOnce, (k + 1) * atOnce)));
-  footprints[name] = {
-    kind, variance, samples: nodes.length, vertex: drawVertexShader(kind, samples),
-    fragments: { 4: passes(4), 8: passes(8) },
-  };
+  if (samples > 1 || !(kind in GL_KINDS)) continue;
+  footprints[name] = { kind, variance, vertex: drawVertexShader(kind), fragment: drawFragmentShader(kind) };
   projections[kind] = DEGREES.map(degree => projectShader(kind, degree));
 }
 console.log(JSON.stringify({
   near: CONSTANTS.kNear, frustum_clamp: CONSTANTS.kFrustumClamp, splats_per_row: SPLATS_PER_ROW,
   splats_per_instance: SPLATS_PER_INSTANCE, texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
-  window: Array.from(windowTable()), full_screen: FULL_SCREEN, add: ADD, projections, footprints,
+  full_screen: FULL_SCREEN, projections, footprints,
 }));
 """
 HALF, FULL = "f2", "f4"  # what is blended, as moderngl calls it
@@ -261,7 +256,7 @@ def create_context():
 
 
 class Renderer:
-    """What project.js and draw.js do, for one scene."""
+    """What webgl_project.js and webgl.js do, for one scene."""
 
     def __init__(self, context, job: Job):
         self.context, self.job, self.shaders = context, job, job.shaders
@@ -269,10 +264,8 @@ class Renderer:
         self.rows = -(-count // width)
         texels = self.shaders["texels_of_harmonics"][job.degree]
         self.harmonics_per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
-        self.samples_per_pass = 8 if context.info["GL_MAX_DRAW_BUFFERS"] >= 8 else 4
         self.geometry = self.filled(3 * width, 4, "f4", job.geometry)
         self.harmonics = self.filled(texels * self.harmonics_per_row, 4, "f2", job.harmonics)
-        self.window = self.filled(2, 4, "f4", np.array(self.shaders["window"], np.float32))
         self.order = self.texture(width, self.rows, 1, "u4")
         self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
         self.splats_target = context.framebuffer(self.splats)
@@ -296,12 +289,11 @@ class Renderer:
         padded[: data.size] = data.reshape(-1)
         return self.texture(width, rows, components, dtype, padded.tobytes())
 
-    def target(self, name: str, camera: Camera, dtype: str, count: int = 1):
-        """A framebuffer with `count` textures of the size of the picture."""
-        key = (name, camera.width, camera.height, dtype, count)
+    def target(self, camera: Camera, dtype: str):
+        """A framebuffer of the size of the picture."""
+        key = (camera.width, camera.height, dtype)
         if key not in self.targets:
-            pictures = [self.texture(camera.width, camera.height, 4, dtype) for _ in range(count)]
-            self.targets[key] = self.context.framebuffer(pictures)
+            self.targets[key] = self.context.framebuffer([self.texture(camera.width, camera.height, 4, dtype)])
         return self.targets[key]
 
     def program(self, vertex: str, fragment: str, indices=None):
@@ -358,40 +350,20 @@ class Renderer:
     def draw(self, camera: Camera, name: str, dtype: str):
         """Draws the splats of the last projection; returns the framebuffer that holds the picture."""
         footprint, context = self.shaders["footprints"][name], self.context
-        context.viewport = (0, 0, camera.width, camera.height)
-        context.enable(context.BLEND)
-        if footprint["samples"] == 1:
-            picture = self.target("picture", camera, dtype)
-            self.draw_samples(picture, camera, footprint["vertex"], footprint["fragments"]["8"][0])
-            return picture
-        # Every sample has a picture of its own; the result is their mean.
-        at_once = 4 if dtype == FULL else self.samples_per_pass
-        picture = self.target("sum", camera, FULL)
-        for k, fragment in enumerate(footprint["fragments"][str(at_once)]):
-            samples = self.target("samples", camera, dtype, min(at_once, footprint["samples"]))
-            self.draw_samples(samples, camera, footprint["vertex"], fragment)
-            picture.use()
-            if k == 0:
-                picture.clear()
-            context.blend_func = context.ONE, context.ONE
-            program, vertices = self.program(self.shaders["full_screen"], self.shaders["add"])
-            for sample in samples.color_attachments:
-                self.set_uniforms(program, {"uPicture": sample}, uFactor=1 / footprint["samples"])
-                vertices.render(context.TRIANGLES, vertices=3)
-        return picture
-
-    def draw_samples(self, target, camera: Camera, vertex: str, fragment: str) -> None:
-        context = self.context
-        program, vertices = self.program(vertex, fragment, self.corners)
+        program, vertices = self.program(footprint["vertex"], footprint["fragment"], self.corners)
+        target = self.target(camera, dtype)
         target.use()
         target.clear()
+        context.viewport = (0, 0, camera.width, camera.height)
+        context.enable(context.BLEND)
         context.blend_func = context.ONE, context.ONE_MINUS_SRC_ALPHA
         names = ("uMean", "uWhitening", "uColor")
-        textures = dict(zip(names, self.splats)) | {"uOrder": self.order, "uWindow": self.window}
+        textures = dict(zip(names, self.splats)) | {"uOrder": self.order}
         self.set_uniforms(program, textures, uVisible=self.visible, uSize=(camera.width, camera.height))
         instances = -(-self.visible // self.shaders["splats_per_instance"])
         if instances > 0:
             vertices.render(context.TRIANGLES, instances=instances)
+        return target
 
     def render(self, camera: Camera, name: str, dtype: str):
         self.project(camera, name)

@@ -258,7 +258,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
         raise ValueError(f"size must be positive multiples of 8, got {size[0]} x {size[1]}")
     out = Path(out)
     scene, view = make_target()
-    save_scene(out / "target.ply", scene, SceneMetadata(footprint="moment"))
+    save_scene(out / "target.ply", scene, SceneMetadata(footprint="moment", background=PAPER))
     zoom = size[0] / view.width  # pixels are square whatever the size
     view = View(view.name, *size, FOCAL * zoom, FOCAL * zoom, view.w2c)
     save_views(out / "views.json", [view])

@@ -14,8 +14,8 @@ S the largest change of that output, in float64, when each input is perturbed by
 number of that output. OPERATIONS = 100 counts the roundings on the longest path from an input to a
 gradient: about 40 in the projection, 20 in the weight, 5 in the compositing, 35 on the way back; each acts like
 one more perturbation of that kind. Gradients are measured Gaussian by Gaussian, relative to the largest entry
-of that Gaussian alone, so that no large gradient hides a small one. Deep stacks add a rounding per layer
-(`Case.layers`).
+of that Gaussian alone, so that no large gradient hides a small one. Deep stacks add three roundings per
+layer (`Case.layers`).
 
 Two limits are wider, because the formula is:
 

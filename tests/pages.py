@@ -9,10 +9,14 @@ import torch
 
 from analytic_rasterizer import io, render_stages, viewer
 from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.viewer.packing import PAGE_ENTRIES
 
 PATIENCE = 600
 """Seconds to wait for the page: drawing in software on a busy machine takes its time."""
 REDUCTIONS = (pytest.param(1, marks=pytest.mark.gate), 2, 4, 8)
+
+WEBGL_FOOTPRINTS = tuple(entry["name"] for entry in PAGE_ENTRIES if entry["instead"] is None)
+"""What the page draws with WebGL 2: one sample, which does not move."""
 
 # Blended in 32-bit floats, a picture differs from the rasterizer's by splats whose alpha is 1/255 but for rounding: one
 # of the two leaves them out, which is less than one level of 255 and concerns few pixels. Rounded to 8 bits that is at
@@ -22,8 +26,8 @@ ROOT_MEAN_SQUARE = 0.05
 # In half floats every blend rounds too, by 2^-12 of the colour.
 ROOT_MEAN_SQUARE_OF_HALVES = 0.1
 
-READ_PIXELS = """() => {
-  const bytes = new Uint8Array(analyticPixels().buffer);
+READ_PIXELS = """async () => {
+  const bytes = new Uint8Array((await analyticPixels()).buffer);
   let text = '';
   for (let i = 0; i < bytes.length; i += 32768) text += String.fromCharCode(...bytes.subarray(i, i + 32768));
   return btoa(text);

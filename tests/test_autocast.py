@@ -3,6 +3,7 @@ are refused with the way out."""
 
 import pytest
 import torch
+from conftest import needs_newer_compiler
 from originals import CAMERA, COUNT, ORIGINALS, arguments_of, fields_of, scene_of
 
 import analytic_rasterizer as ar
@@ -259,6 +260,7 @@ def test_elsewhere_they_are_refused_with_the_way_out(device, half, name):
             call(in_full(inputs(device), lambda t: t.to(half)))
 
 
+@needs_newer_compiler
 def test_torch_compile_traces_the_casts(device):
     """Without a break, and for autocast that is on as for one that is off."""
     given = scene(device)

@@ -6,6 +6,7 @@ from typing import ClassVar
 import pytest
 import scenes
 import torch
+from conftest import needs_newer_compiler
 from torch._subclasses import FakeTensorMode
 
 import analytic_rasterizer as ar
@@ -121,6 +122,7 @@ def test_what_overrides_functions_of_torch_sees_the_op(device):
     assert any("rasterize" in str(function) for function in Logged.seen)
 
 
+@needs_newer_compiler
 def test_torch_compile(device):
     """It traces through the rasterizer without a break, by torch.ops."""
     settings = CAMERA.settings(torch.float32, device)
@@ -156,6 +158,7 @@ class Pictures(torch.nn.Module):
     [None, ar.Effects(alpha=True, depth=True), ar.Effects(median_depth=True, gaussian_stats=True)],
     ids=["plain", "images", "summaries"],
 )
+@needs_newer_compiler
 def test_torch_export_for_any_number_of_gaussians(device, effects):
     names = "means3D", "opacities", "shs", "scales", "rotations"
     module = Pictures(CAMERA.settings(torch.float32, device, effects=effects))

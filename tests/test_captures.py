@@ -148,7 +148,7 @@ def test_capture_is_read_as_it_was_taken(name, count, points):
     means, colors = capture.points
     assert len(capture.train) + len(capture.test) == count and len(means) == (points or len(means))
     item = capture.train[8]
-    view, rgba = pictures.fitted(pictures.read_picture(item.files[1]), item, 16)
+    view, rgba, _ = pictures.fitted(pictures.read_picture(item.files[1]), item, 16)
     assert rgba.shape == (view.height, view.width, 4) and view.height % 16 == view.width % 16 == 0
     stages = render_stages(view.settings(), **point_inputs(means))
     colors = colors[stages.ids.long()]
@@ -267,15 +267,23 @@ def test_nerfstudio_lists_of_other_things(tmp_path, lists, message):
     assert str(raised.value) == f"{tmp_path / 'transforms.json'}: {message}"
 
 
-def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
-    def add_masks(content):
+def test_masks_of_nerfstudio(tmp_path):
+    def add_masks(content, name="masks/r.png"):
         for frame in content["frames"][::3]:
-            frame["mask_path"] = "masks/r.png"
+            frame["mask_path"] = name
 
     write_nerfstudio(tmp_path, add_masks)
-    with pytest.warns(UserWarning, match="the masks of 3 pictures are ignored") as told:
-        assert len(training.load_capture(tmp_path).train) == 7
-    assert len(told) == 1 and told[0].filename == __file__
+    with pytest.raises(io.SceneError, match=r"frame 0: mask_path must name a picture beside the file, got .*r\.png"):
+        training.load_capture(tmp_path)
+    write_grey(tmp_path / "masks", circle(1, (35, 33)), ["r.png"])
+    found = training.load_capture(tmp_path)
+    assert found.notes == ("3 of 9 photographs have a mask, whose black pixels do not count",)
+    masked = [item.view.name for item in (*found.train, *found.test) if item.mask == tmp_path / "masks" / "r.png"]
+    assert sorted(masked) == ["r_0", "r_3", "r_6"]
+    assert training.load_capture(tmp_path, masks="none").notes == ()
+    write_nerfstudio(tmp_path / "other", lambda content: add_masks(content, 3))
+    with pytest.raises(io.SceneError, match="frame 0: mask_path must name a picture beside the file, got 3"):
+        training.load_capture(tmp_path / "other")
 
 
 @pytest.mark.parametrize(
@@ -440,7 +448,7 @@ def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
 
 
 def fitted(path, view, multiple):
-    return pictures.fitted(pictures.read_picture(path), training.Photograph(view, {1: path}), multiple)
+    return pictures.fitted(pictures.read_picture(path), training.Photograph(view, {1: path}), multiple)[:2]
 
 
 def test_cut_pictures_see_the_same(tmp_path):
@@ -477,10 +485,10 @@ def test_pictures_that_were_turned_are_refused(tmp_path):
 def test_colors_of_reduced_pictures(downsampling):
     """They count by their alpha, but in the files of the multi-scale Blender set."""
     rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
-    plain = pictures.reduce(rgba, 1, captures.WHITE, downsampling)
+    plain = pictures.reduce(rgba, 1, captures.WHITE, downsampling)[0]
     assert plain[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
-    on_white = pictures.reduce(rgba, 2, captures.WHITE, downsampling)[:, 0, 0].tolist()
-    premultiplied = pictures.reduce(rgba, 2, None, downsampling)[:, 0, 0].tolist()
+    on_white = pictures.reduce(rgba, 2, captures.WHITE, downsampling)[0][:, 0, 0].tolist()
+    premultiplied = pictures.reduce(rgba, 2, None, downsampling)[0][:, 0, 0].tolist()
     if downsampling == "blender":
         assert on_white == [191, 191, 128] and premultiplied == [64, 64, 0, 128]  # 255 (0.5 * 0.5 + 0.5), 128
     else:
@@ -494,7 +502,7 @@ def test_reduced_pictures_of_one_color_keep_it(downsampling, scale):
     alpha = torch.randint(256, (16, 24), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.stack([*torch.full((3, 16, 24), 255, dtype=torch.uint8), alpha], 2)
     rgba[..., :3][alpha == 0] = 0  # as programs store what nobody sees
-    assert (pictures.reduce(rgba, scale, captures.WHITE, downsampling) == 255).all()
+    assert (pictures.reduce(rgba, scale, captures.WHITE, downsampling)[0] == 255).all()
 
 
 @pytest.mark.parametrize("scale", [2, 4])
@@ -503,7 +511,7 @@ def test_bicubic_reduction_is_that_of_pillow(scale):
     pixels = torch.randint(256, (16, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.cat([pixels, torch.full((16, 24, 1), 255, dtype=torch.uint8)], dim=2)
     expected = image.fromarray(pixels.numpy()).resize((24 // scale, 16 // scale), image.Resampling.BICUBIC)
-    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic").permute(1, 2, 0)
+    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic")[0].permute(1, 2, 0)
     assert (got.int() - torch.from_numpy(np.array(expected)).int()).abs().max() <= 1
 
 
@@ -766,18 +774,18 @@ FOUND = {
         lambda f: only_transforms(f, frames=frames("images/{}.png", 2)),
         "training needs at least 2 pictures, got 1 of 2, .*; --test-every 0 trains with all",
     ),
-    "masks": (masked, {"masks": 9, "warns": "the masks of 9 pictures are ignored"}),
+    "masks": (masked, {"notes": "9 of 9 photographs have a mask, whose black pixels do not count"}),
     **{
         f"masks in {name}": (
             lambda f, name=name: masked(f, name),
-            {"masks": 9, "warns": "the masks of 9 pictures are ignored"},
+            {"ignored_masks": 9, "warns": "9 masks are ignored, all pixels count: masks of photographs belong in"},
         )
-        for name in ("Masks", "images/masks", "images_mask", "dynamic-MASKS/cam0")
+        for name in ("images/masks", "images_mask", "dynamic-MASKS/cam0")
     },
-    "pictures that are no masks": (lambda f: masked(f, "unmasked"), {"masks": 0}),
+    "pictures that are no masks": (lambda f: masked(f, "unmasked"), {"ignored_masks": 0, "notes": ()}),
     "masks of a transforms.json": (
         lambda f: [masked(f), beside(f), shutil.rmtree(f / "sparse")],
-        {"masks": 9, "warns": "the masks of 9 pictures are ignored"},
+        {"ignored_masks": 9, "warns": "9 masks are ignored"},
     ),
     "several models": (
         lambda f: models(f, [3, 9, 5]),
@@ -887,7 +895,7 @@ def test_captures_of_the_field(tmp_path, case):
     for item in photographs:
         if item.view.name in written and found.offset is None and "zero" not in case:
             torch.testing.assert_close(item.view.w2c, written[item.view.name].w2c, rtol=0, atol=1e-6)
-    for name in ("notes", "offset", "masks", "starts_in_view"):
+    for name in ("notes", "offset", "ignored_masks", "starts_in_view"):
         if name == "notes" and isinstance(expected.get(name), str):
             assert any(re.search(expected[name], note) for note in found.notes), found.notes
         elif name in expected:
@@ -947,8 +955,8 @@ def test_lenses_can_be_refused(tmp_path):
     write(tmp_path, "SIMPLE_RADIAL", [-0.1])
     with pytest.raises(io.SceneError, match=r"9 of 9 photographs have a lens, .*\(perspective\)"):
         training.load_capture(tmp_path, lens="refuse")
-    with pytest.raises(ValueError, match="lens must be one of exact, undistort, refuse, got keep"):
-        training.load_capture(tmp_path, lens="keep")
+    with pytest.raises(ValueError, match="lens must be one of keep, undistort, refuse, got exact"):
+        training.load_capture(tmp_path, lens="exact")
 
 
 def test_a_lens_that_cannot_be_undistorted(tmp_path):
@@ -1052,13 +1060,13 @@ def test_a_checkpoint_without_an_offset_stays_in_the_world(tmp_path):
     assert train(tmp_path / "far", tmp_path / "out", "--iterations", "2") == 0
     path = tmp_path / "out" / files.CHECKPOINT
     state = torch.load(path, weights_only=True)
-    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "exact"
+    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "keep"
     assert state["source"].pop("cameras") is None
     torch.save(state, path)
     assert train(tmp_path / "far", tmp_path / "out", "--resume") == 0
     resumed = training.Run(tmp_path / "far", tmp_path / "out", resume=True)
-    assert resumed.source["offset"] is None and resumed.source["lens"] == "exact"
-    with pytest.raises(ValueError, match="lens must be exact or None where a training is resumed, got refuse"):
+    assert resumed.source["offset"] is None and resumed.source["lens"] == "keep"
+    with pytest.raises(ValueError, match="lens must be keep or None where a training is resumed, got refuse"):
         training.Run(tmp_path / "far", tmp_path / "out", resume=True, lens="refuse")
 
 
@@ -1066,12 +1074,12 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     """Each in a line, by the training and by the test."""
     write(tmp_path / "scene", "SIMPLE_RADIAL", [-0.1])
     (tmp_path / "scene" / "sparse" / "0" / "points3D.bin").unlink()
-    assert train(tmp_path / "scene", tmp_path / "exact", "--iterations", "1", "--random-points", "50") == 0
+    assert train(tmp_path / "scene", tmp_path / "kept", "--iterations", "1", "--random-points", "50") == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
     assert len(said) == 2 and re.search(EXACT % "perspective", said[0])
-    assert all(view.lens is not None for view in io.load_views(tmp_path / "exact" / "cameras.json"))
-    assert cli.main(["evaluate", str(tmp_path / "exact"), "--lpips", "none", "--pictures", "0"]) == 0
-    assert json.loads((tmp_path / "exact" / "evaluation.json").read_text())["resampled"] == 0
+    assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
+    assert cli.main(["evaluate", str(tmp_path / "kept"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert json.loads((tmp_path / "kept" / "evaluation.json").read_text())["resampled"] == 0
     assert re.search(EXACT % "perspective", capsys.readouterr().err)
     options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
     assert train(tmp_path / "scene", tmp_path / "out", *options) == 0
@@ -1162,6 +1170,6 @@ def test_pictures_without_alpha_stay_as_they_are_stored(background):
     computed = rgba.clone()
     computed[0, 0, 3] = 254
     for downsampling in ("box", "bicubic", "blender"):
-        kept, other = (pictures.reduce(picture, 1, background, downsampling) for picture in (rgba, computed))
+        kept, other = (pictures.reduce(picture, 1, background, downsampling)[0] for picture in (rgba, computed))
         assert torch.equal(kept, rgba.permute(2, 0, 1)[: 4 if background is None else 3]) and kept.is_contiguous()
         assert torch.equal(kept[:, 1:], other[:, 1:]) and torch.equal(kept[:, 0, 1:], other[:, 0, 1:])

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -227,7 +228,6 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ([], "the following arguments are required: COMMAND"),
         (["paint"], "invalid choice: 'paint'"),
         (["render"], "the following arguments are required: SCENE, --out"),
         (["render", "{}", "--out", "{}/out"], "a folder without a scene: expected scene.ply with options.json, which"),
@@ -475,6 +475,16 @@ def test_errors_of_bake_are_one_line(files, capsys, extra, message):
 def test_version_and_help(capsys):
     assert leave(["--version"]) == 0
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
+
+
+def test_without_a_command_it_says_what_is_installed(capsys):
+    """And which wheels fit this torch."""
+    assert leave([]) == 0
+    first, second, _, line, last = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"analytic_rasterizer {ar.__version__}, built for torch {torch.__version__}, for the CPU")
+    assert second.startswith(f"torch {torch.__version__} with ")
+    assert re.fullmatch(r"    pip install --index-url INDEX/pt\d+(cpu|cu\d+) analytic-rasterizer", line)
+    assert "--help" in last
     for args in ([], ["render"], ["errors"], ["pareto"], ["inspect"]):
         args = [*args, "--help"]
         assert leave(args) == 0

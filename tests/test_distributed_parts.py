@@ -31,6 +31,7 @@ VARIANTS = {
     "table": {"packed": False, "rasterize_mode": "antialiased", "absgrad": True},
     "depth": {"render_mode": "D"},
     "harmonics": {"sh_degree": 1, "footprint": "box:samples=16"},
+    "lens": {"camera_model": "fisheye", "render_mode": "RGB-Ed", "return_normals": True, "extra_signals_sh_degree": 1},
 }
 PER_RANK = 2  # cameras of gsplat's
 
@@ -126,15 +127,21 @@ def band_mistake(rank):
 
 def gaussians_of(variant):
     degree = VARIANTS[variant].get("sh_degree", 0)
-    return test_gsplat.scene_of(torch.float64, "cpu", degree, count=COUNT)
+    scene = test_gsplat.scene_of(torch.float64, "cpu", degree, count=COUNT)
+    if variant == "lens":
+        scene["extra_signals"] = test_gsplat.weights((COUNT, 4, 2), torch.float64, "cpu")
+    return scene
 
 
-def cameras_of(world):
+def cameras_of(world, variant=None):
     """Those of all ranks."""
     eyes = [(0.3 + 0.4 * k, -0.2, -4.0 + 0.1 * k) for k in range(world * PER_RANK)]
     cameras = test_gsplat.cameras_of(torch.float64, "cpu", 1)
     views = torch.stack([Camera(eye=eye).world_to_camera() for eye in eyes])
-    return {"viewmats": views, "Ks": cameras["Ks"].expand(len(eyes), 3, 3).clone()}
+    lenses = {}
+    if variant == "lens":
+        lenses["radial_coeffs"] = torch.linspace(-0.05, 0.05, 4 * len(eyes), dtype=torch.float64).reshape(-1, 4)
+    return {"viewmats": views, "Ks": cameras["Ks"].expand(len(eyes), 3, 3).clone()} | lenses
 
 
 def gsplat_of(variant, scene, cameras, options=None):
@@ -148,6 +155,7 @@ def gsplat_of(variant, scene, cameras, options=None):
     )
     meta["means2d"].retain_grad()
     weight = weights(*images.shape[1:3]).double()
+    images = torch.cat([images, *(meta[name] for name in ("render_extra_signals", "normals") if name in meta)], -1)
     (images * weight[0, :, :, None]).sum().add((alphas * weight[1, :, :, None]).sum()).backward()
     return {
         "images": images.detach(),
@@ -194,7 +202,7 @@ def work(rank, folder):
         made["low"] = band_of(FOOTPRINTS[0], torch.float32, SHARDS[world], rank, camera=LOW)
         made["background"] = background_alone(SHARDS[world], rank)
         for variant in VARIANTS:
-            cameras = {name: t[rank * PER_RANK :][:PER_RANK] for name, t in cameras_of(world).items()}
+            cameras = {name: t[rank * PER_RANK :][:PER_RANK] for name, t in cameras_of(world, variant).items()}
             scene = rows_of(gaussians_of(variant), SHARDS[world], rank)
             made[variant] = gsplat_of(variant, scene, cameras, {"distributed": True})
         if world == 2:
@@ -328,7 +336,7 @@ def test_bands_are_balanced():
 def test_gsplats_ranks_make_what_one_process_makes(made, world, variant):
     """Images, and gradients of Gaussians, bit for bit; those of cameras are sums over the ranks."""
     parts = [of_rank[variant] for of_rank in made[world]]
-    expected = gsplat_of(variant, gaussians_of(variant), cameras_of(world))
+    expected = gsplat_of(variant, gaussians_of(variant), cameras_of(world, variant))
     for name in ("images", "alphas"):
         assert torch.equal(torch.cat([part[name] for part in parts]), expected[name])
     assert expected["images"].abs().max() > 0
@@ -336,7 +344,7 @@ def test_gsplats_ranks_make_what_one_process_makes(made, world, variant):
         if whole is None:  # colours, of depth alone
             continue
         whole_of_ranks = torch.cat([part["gradients"][name] for part in parts])
-        if name in ("viewmats", "Ks"):
+        if name in ("viewmats", "Ks", "radial_coeffs"):
             error = (whole_of_ranks - whole).norm()
             assert error <= test_gsplat.gradient_tolerance(torch.float64) * whole.norm() and whole.norm() > 0
         else:
@@ -346,7 +354,7 @@ def test_gsplats_ranks_make_what_one_process_makes(made, world, variant):
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_gsplats_meta_is_of_the_own_gaussians_in_all_cameras(made, world, variant):
-    expected = gsplat_of(variant, gaussians_of(variant), cameras_of(world))
+    expected = gsplat_of(variant, gaussians_of(variant), cameras_of(world, variant))
     first = 0
     for of_rank, count in zip(made[world], SHARDS[world]):
         part, own = of_rank[variant], slice(first, first + count)

@@ -406,6 +406,7 @@ METADATA = {
     "another dilation": io.SceneMetadata(footprint="point:dilation=0.1"),
     "of another program": io.SceneMetadata(antialiased=True),
     "far away": io.SceneMetadata(footprint="moment", offset=(500000.123456789, -4.2e6, 1e-9)),
+    "on paper": io.SceneMetadata(footprint="moment", background=(0.97, 0.96, 0.93)),
     "comments": io.SceneMetadata(comments=("made by hand", "  ", "a 'quoted' #1")),
 }
 
@@ -421,7 +422,8 @@ def test_what_a_scene_says_comes_back(tmp_path, name, metadata):
     copied = (tmp_path / name).rename(tmp_path / "away" / name)
     assert io.is_scene(copied)
     found, wanted = io.read_metadata(copied), metadata.checked()
-    assert (found.footprint, found.offset) == (wanted.footprint, wanted.offset)
+    names = ("footprint", "offset", "background")
+    assert [getattr(found, name) for name in names] == [getattr(wanted, name) for name in names]
     assert found.comments == tuple(comment.strip() for comment in wanted.comments)
     assert bool(found.antialiased) is bool(wanted.antialiased)
     plain = io.read_metadata(tmp_path / f"plain.{name}")

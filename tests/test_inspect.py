@@ -312,3 +312,15 @@ def test_a_lens_belongs_to_the_camera():
     expected = ar.render_stages(settings._replace(footprint="box:samples=1", sh_degree=0), **scene.arguments())
     assert torch.equal(got.color, expected.color)
     assert planner.inspect_scene(scene, [view], rounds=1).views[0].shown > 0
+
+
+def test_splats_that_are_no_picture_of_their_gaussians():
+    """Large Gaussians right before a camera bend; small ones do not."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 4.0
+    view = io.View("wide", 83, 61, 30.0, 30.0, pose, lens=ar.Lens.fisheye())
+    for sizes, needed in (("fine", False), ("large", True)):
+        scene = random_scene("cpu", count=200, sizes=sizes)
+        (finding,) = (f for f in planner.inspect_scene(scene, [view], rounds=1).findings if f.name == "affine picture")
+        assert finding.needed is needed and "wide shows" in finding.reason
+        assert finding.recommendation == ("pictures of narrower views" if needed else "as it is")

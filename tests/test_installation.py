@@ -13,6 +13,7 @@ from processes import run_program
 from analytic_rasterizer import _C, installation
 
 PACKAGES = ("analytic_rasterizer", "diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
+HERE = installation.wheel_folder(torch.__version__, torch.version.cuda)
 LIBRARY = next((ROOT / "analytic_rasterizer").glob("_C.*.so"))
 
 
@@ -73,6 +74,7 @@ def test_an_extension_that_was_built_for_another_torch(tmp_path):
     sentence = failure(tmp_path)
     assert f"was built for torch {other.decode()} and cannot be loaded with torch {torch.__version__}," in sentence
     assert "undefined symbol: _ZN3c99" in sentence
+    assert f"install the wheel of {HERE} (docs/install.md), or build it for this torch" in sentence
     assert "`pip install --force-reinstall --no-deps path/to/analytic_rasterizer`" in sentence
 
 
@@ -95,3 +97,35 @@ def test_an_extension_of_another_torch_that_can_be_loaded():
             installation.warn_if_built_for_another(f"analytic_rasterizer was built for torch {version}")
     with pytest.warns(UserWarning, match=rf"for torch {major}\.99\.0, and torch {major}\.{minor}.* calls may crash"):
         installation.warn_if_built_for_another(f"analytic_rasterizer was built for torch {major}.99.0")
+
+
+def test_a_wheel_for_another_torch_says_so_in_one_sentence_at_import(tmp_path):
+    """As after `pip install --no-deps` of the wrong wheel, which can be loaded."""
+    package = copy_of_packages(tmp_path)
+    before, after = b"was built for torch 2.", b"was built for torch 9."
+    library = LIBRARY.read_bytes()
+    assert library.count(before) == 1
+    (package / LIBRARY.name).write_bytes(library.replace(before, after))
+    program = "import sys; sys.meta_path[:] = [f for f in sys.meta_path if 'Editable' not in str(f)]\n"
+    program += "import analytic_rasterizer; print(analytic_rasterizer.__file__)"
+    done = run_program(program, environment=os.environ | {"PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 0 and done.stdout.strip() == str(package / "__init__.py")
+    (warning,) = [line for line in done.stderr.splitlines() if "UserWarning" in line]
+    expected = (
+        f"was built for torch {torch.__version__.replace('2.', '9.', 1)}, and torch {torch.__version__} is installed"
+    )
+    assert expected in warning and f"install the wheel of {HERE}" in warning
+
+
+@pytest.mark.parametrize(
+    ("version", "cuda", "folder"),
+    [("2.13.0+cpu", None, "pt213cpu"), ("2.11.0+cu130", "13.0", "pt211cu130"), ("2.4.1a0+git", "12.1", "pt24cu121")],
+)
+def test_the_folder_of_the_wheels_that_fit(version, cuda, folder):
+    assert installation.wheel_folder(version, cuda) == folder
+
+
+def test_what_is_installed_is_said_with_the_wheels_that_fit():
+    text = installation.about("1.2.3", "analytic_rasterizer was built for torch 2.11.0+cu130", has_cuda=True)
+    assert text.startswith("analytic_rasterizer 1.2.3, built for torch 2.11.0+cu130, for the CPU and CUDA\n")
+    assert f"--index-url INDEX/{HERE} analytic-rasterizer" in text

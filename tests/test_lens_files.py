@@ -31,6 +31,7 @@ PARAMETERS = {
         200.0, 210.0, 321.0, 239.0, 0.02, -0.004, 0.001, -1e-5, 4e-6, -3e-7, 0.002, -0.003, 0.004, 0.001, -0.005, 2e-4
     ],
     "FOV": [300.0, 310.0, 321.0, 239.0, 0.9],
+    "EQUIRECTANGULAR": [640.0, 480.0],
 }  # fmt: skip
 REFUSED = {
     "SIMPLE_DIVISION": [400.0, 321.0, 239.0, -0.1],
@@ -128,6 +129,7 @@ def test_lenses_of_nerfstudio(tmp_path):
         frame(camera_model="PINHOLE", k1=0.0),
         frame(is_fisheye=True, k1=0.01),
         frame(camera_model="FULL_OPENCV", k1=-0.1, k4=0.01),
+        frame(camera_model="EQUIRECTANGULAR"),
     ]
     views = io.load_views(write_transforms(tmp_path / "transforms.json", frames))
     assert [view.lens for view in views] == [
@@ -138,7 +140,9 @@ def test_lenses_of_nerfstudio(tmp_path):
         None,
         ar.Lens.fisheye((0.01,)),
         ar.Lens.perspective((-0.1, 0, 0, 0.01)),
+        ar.Lens.equirectangular(),
     ]
+    assert views[-1].fx == pytest.approx(640 / (2 * math.pi)) and views[-1].middle == (320, 240)
     shared = write_transforms(tmp_path / "shared.json", [frame(), frame(k1=0.2)], camera_model="OPENCV", k1=-0.1)
     assert [view.lens.coefficients[0] for view in io.load_views(shared)] == [-0.1, 0.2]
 
@@ -147,7 +151,11 @@ def test_lenses_of_nerfstudio(tmp_path):
     "members, match",
     [
         ({"camera_model": "FTHETA"}, "frame 0: camera_model must be one of SIMPLE_PINHOLE, .*, got 'FTHETA'"),
-        ({"camera_model": "FOV", "k1": 1.0}, "frame 0: .*"),
+        ({"camera_model": "FOV", "k1": 1.0}, "frame 0: camera_model FOV is not one of nerfstudio's"),
+        (
+            {"camera_model": "EQUIRECTANGULAR", "k1": 1.0},
+            "frame 0: EQUIRECTANGULAR must have no coefficients, got k1",
+        ),
         ({"k4": 0.1}, "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1"),
         ({"distortion_params": [0.0, 0.1]}, r"got distortion_params = \[0.0, 0.1\]; undistort the pictures first"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE must have no coefficients but k1, k2, k3, k4"),
@@ -220,3 +228,44 @@ def test_sampling_intervals_of_lenses():
         smaller = torch.linalg.svdvals(torch.stack(slopes, 2))[:, 1]
         assert torch.allclose(got[:2], 1 / smaller, rtol=1e-4), lens
         assert (got[2:] == got[:2].max()).all()  # seen by no camera
+
+
+@pytest.mark.parametrize(
+    "lens", [ar.Lens.perspective((-0.15, 0.03)), ar.Lens.fisheye((0.03,)), ar.Lens.equirectangular()]
+)
+def test_training_with_lenses(tmp_path, lens):
+    """Pictures of a scene through a lens make the scene again, on the way of the trainer that the lens has."""
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    training = pytest.importorskip("analytic_rasterizer.training", reason="needs the train extra")
+    from capture_files import circle, opengl_pose, truth_gaussians
+
+    truth = truth_gaussians()
+    points = truth.means.detach()
+    sphere = lens.model == "equirectangular"
+    size = {"w": 96, "h": 48} if sphere else {"w": 40, "h": 32}
+    names = {"perspective": "OPENCV", "fisheye": "OPENCV_FISHEYE", "equirectangular": "EQUIRECTANGULAR"}
+    given = dict(zip(("k1", "k2"), lens.coefficients)) if not sphere else {}
+    frames = []
+    for view in circle(9):
+        frames.append(frame(camera_model=names[lens.model], fl_x=40.0, **given, **size))
+        frames[-1] |= {"file_path": f"{view.name}.png", "transform_matrix": opengl_pose(view)}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    for frame_of, name in ((f, f["file_path"]) for f in frames):
+        image.new("RGB", (frame_of["w"], frame_of["h"])).save(tmp_path / name)
+    for view, frame_of in zip(io.load_views(tmp_path / "transforms.json"), frames):
+        assert view.lens.model == lens.model
+        with torch.no_grad():
+            shown, _ = ar.GaussianRasterizer(view.settings(sh_degree=0, footprint="box:samples=16"))(
+                means2D=None, **truth.arguments()
+            )
+        levels = (255 * shown.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
+        image.fromarray(levels).save(tmp_path / frame_of["file_path"])
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in "xyz"] + ["end_header"]
+    (tmp_path / "sparse_pc.ply").write_text("\n".join([*header, *(f"{x} {y} {z}" for x, y, z in points.tolist()), ""]))
+    options = training.TrainingOptions(iterations=400, density="none", sh_degree=0)
+    run = training.Run(tmp_path, tmp_path / "out", options)
+    assert run.trainer.in_one_op is not sphere
+    before = run.evaluate()["test"]["mean"]["psnr"]
+    run.train()
+    assert run.evaluate()["test"]["mean"]["psnr"] > before + 3

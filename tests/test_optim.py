@@ -5,7 +5,7 @@ import io
 
 import pytest
 import torch
-from conftest import needs_cuda
+from conftest import needs_cuda, needs_newer_compiler
 from torch.optim import Adam
 
 import analytic_rasterizer as ar
@@ -601,6 +601,7 @@ def test_what_a_step_refuses():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@needs_newer_compiler
 def test_opcheck(device, dtype):
     state = make_state([(6, 3), (6,)], dtype, device)
     numbers = [0.1, 0.2], [1, 2], 0.9, 0.999, 1e-8

@@ -2,8 +2,10 @@
 
 import json
 import math
+import re
 import struct
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -153,6 +155,27 @@ def test_blurred_photographs_are_named(tmp_path):
     assert found["exposure"].verdict == NO
 
 
+def test_what_masks_hide_is_not_looked_at(tmp_path):
+    """Every second photograph is a stop brighter where its mask hides it."""
+    folder = write_wall(tmp_path / "wall", gains=lambda i: (2 ** (0.5 - i % 2),) * 3)
+    for view in cameras():
+        path = folder / "images" / f"{view.name}.png"
+        picture = np.array(image.open(path))
+        picture[:, : SIZE[0] // 4] = photograph(view)[:, : SIZE[0] // 4]
+        image.fromarray(picture).save(path)
+        mask = np.zeros(SIZE[::-1], np.uint8)
+        mask[:, : SIZE[0] // 4] = 255
+        (folder / "masks").mkdir(exist_ok=True)
+        image.fromarray(mask).save(folder / "masks" / f"{view.name}.png.png")
+    found = plan_of(folder)
+    assert found["exposure"].verdict == NO and found["masks"].number == COUNT
+    for path in (folder / "masks").iterdir():
+        path.rename(path.with_name(f"other_{path.name}"))
+    found = plan_of(folder)
+    assert found["exposure"].verdict == YES and found["masks"].verdict == NO
+    assert f"{COUNT} files of masks belong to no convention" in found["masks"].reason
+
+
 def test_sampling_intervals_and_scales(tmp_path):
     """From 2 to 3.6 away intervals differ by 1.8, from 1 to 6 by 6."""
     found = plan_of(write_wall(tmp_path / "some", cameras(lambda i: 2 + 1.6 * (i % 2))))
@@ -174,7 +197,7 @@ def test_lens(tmp_path):
     views = cameras(lens=lens)
     folder = write_wall(tmp_path / "wall", views, model=4, coefficients=(-0.05, 0, 0, 0))
     found = plan_of(folder)["lens"]
-    assert found.verdict == YES and found.option == "--lens exact"
+    assert found.verdict == YES and found.option == "--lens keep"
     corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
     ray = views[0].rays_of(corner)[0]
     pinhole = 180 * ray[:2] / ray[2] + torch.tensor([80.0, 60.0])
@@ -192,7 +215,7 @@ def test_more_than_a_half_space(tmp_path):
     """A lens that no pinhole comes near to has no displacement that JSON holds."""
     view = io.View("v", 200, 200, 50.0, 50.0, torch.eye(4, dtype=torch.float64), lens=Lens.fisheye())
     found = plan._lens([plan.Photograph(view, {1: tmp_path / "v.png"})])
-    assert (found.number, found.verdict, found.option) == (None, YES, "--lens exact")
+    assert (found.number, found.verdict, found.option) == (None, YES, "--lens keep")
     assert "1 of 1 photographs have a lens (fisheye)" in found.to_text()
 
 
@@ -301,6 +324,14 @@ def test_medians():
     values = torch.tensor([5.0, 1.0, 2.0, 9.0, 4.0], dtype=torch.float64)
     found = medians_of(values, torch.tensor([2, 0, 2, 2, 0]), 4)
     assert found[[0, 2]].tolist() == [2.5, 5.0] and found[[1, 3]].isnan().all()
+
+
+def test_options_are_those_of_train():
+    source = Path(plan.__file__).read_text(encoding="utf-8")
+    named = sorted(set(re.findall(r'"(--[a-z]+ [a-z]+)"', source))) + [f"--scales {plan.SCALES}"]
+    assert named[:-1] == ["--exposure affine", "--lens keep", "--masks auto", "--missing skip"]
+    for option in named:
+        cli.build_parser().parse_args(["train", "SCENE", "--out", "DIR", *option.split(" ")])
 
 
 def test_inspect_of_a_capture(tmp_path, capsys):

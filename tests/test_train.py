@@ -506,6 +506,8 @@ def picture_arguments(device, **changed):
         "dL_dloss": one,
         "ssim_weight": 0.2,
         "bg": torch.zeros(3, device=device),
+        "exposure": None,
+        "mask": None,
     }
     return dict(zip(names, gaussians)) | others | camera | changed
 
@@ -540,6 +542,9 @@ def test_opcheck_of_picture_gradients(device):
     op = torch.ops.analytic_rasterizer.picture_gradients.default
     for columns in (0, 3, 4):
         torch.library.opcheck(op, (), picture_arguments(device, mean_columns=columns))
+    arguments = picture_arguments(device)
+    mask, exposure = torch.rand(arguments["target"].shape[1:], device=device), torch.rand(3, 4, device=device)
+    torch.library.opcheck(op, (), arguments | {"mask": mask, "exposure": exposure})
 
 
 @pytest.mark.parametrize(
@@ -553,6 +558,9 @@ def test_opcheck_of_picture_gradients(device):
         ({"target": torch.zeros(3, 5, 5, dtype=torch.int32)}, TypeError, "target must have the dtype of means"),
         ({"ssim_weight": 1.5}, ValueError, r"ssim_weight must be in \[0, 1\], got 1.5"),
         ({"dL_dloss": torch.zeros(2)}, ValueError, "dL_dloss must have shape"),
+        ({"mask": torch.zeros(5, 5)}, ValueError, r"mask must have shape \(.*\), got \(5, 5\)"),
+        ({"mask": torch.zeros(5, 5, dtype=torch.uint8)}, TypeError, "mask must have the dtype of means"),
+        ({"exposure": torch.zeros(4, 3)}, ValueError, r"exposure must have shape \(3, 4\), got \(4, 3\)"),
     ],
 )
 def test_errors_of_picture_gradients(changed, error, message):
@@ -1016,7 +1024,7 @@ def test_example_trains(synthetic, tmp_path):
 
 
 def test_evaluate_needs_pictures():
-    empty = pictures.Pictures([], {1: []}, {1: []})
+    empty = pictures.Pictures([], {1: []}, {1: []}, {1: []})
     with pytest.raises(ValueError, match="pictures must have at least one view, got none"):
         evaluate(truth_gaussians().map(torch.Tensor.detach), empty, "box")
 

@@ -105,6 +105,48 @@ def test_without_views_there_is_one_that_sees_the_scene():
     assert inside.float().mean() > 0.8
 
 
+def floor(across, thickness, count=400):
+    """Flat Gaussians that face along axis number `across`, and as many that face anywhere, in a flat box."""
+    g = torch.Generator().manual_seed(1)
+    means = torch.rand(2 * count, 3, generator=g) - 0.5
+    means[:, across] *= thickness
+    scales = torch.full((2 * count, 3), 0.02)
+    scales[:, across] = 1e-4
+    rotations = torch.randn(2 * count, 4, generator=g)
+    rotations[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    return Gaussians.from_activated(
+        means, scales, rotations, torch.full((2 * count, 1), 0.9), torch.zeros(2 * count, 1, 3)
+    )
+
+
+def picture():
+    """Flat Gaussians that all face z, in layers, as the demonstration's."""
+    scene = floor(2, 0.5)
+    return scene._replace(rotations=scene.rotations[:400].repeat(2, 1))
+
+
+@pytest.mark.parametrize(
+    "make, up, ahead, above",
+    [
+        (lambda: floor(1, 0.4), [0, -1, 0], [0, 0, 1], 0.2),
+        (lambda: floor(1, 1.0), [0, -1, 0], [0, 0, 1], 0.2),
+        (lambda: floor(2, 0.4), [0, 0, 1], [0, 1, 0], 0.2),
+        (lambda: floor(0, 0.4), [0, -1, 0], [0, 0, 1], 0.2),
+        (picture, [0, -1, 0], [0, 0, 1], -1e-6),  # it hangs, and is looked at head on
+    ],
+)
+def test_the_first_view_stands_upright_before_the_scene_and_above_its_floor(make, up, ahead, above):
+    meta = viewer.pack_scene(make()).meta
+    w2c = torch.tensor(meta["views"][0]["w2c"]).reshape(4, 4)
+    up, ahead = torch.tensor(up).double(), torch.tensor(ahead).double()
+    right, down, forward = w2c[:3, :3].double()
+    torch.testing.assert_close(torch.linalg.cross(down, forward), right)  # a rotation
+    assert down @ up < -0.9 and forward @ ahead > 0.9 and abs(right @ up) < 1e-6
+    eye = -w2c[:3, :3].double().T @ w2c[:3, 3].double() - torch.tensor(meta["center"])
+    assert above * eye.norm() < eye @ up < 0.4 * eye.norm()
+    assert meta["up"] == up.tolist()
+
+
 def test_one_gaussian_has_a_view():
     (entry,) = viewer.pack_scene(make_scene(1)).meta["views"]
     assert np.isfinite(entry["w2c"]).all()
@@ -142,13 +184,15 @@ def test_an_empty_scene_is_refused():
         ("point:dilation=0", "point:dilation=0.0"),
         ("mip:variance=0.3", "mip:variance=0.3"),
         ("cumulant", "cumulant"),
+        ("moment", "moment:samples=4"),
+        ("moment:samples=16", "moment:samples=16"),
     ],
 )
 def test_names_of_footprints(given, name):
     assert viewer.page_footprint(ar.resolve_footprint(given)) == name
 
 
-@pytest.mark.parametrize("name", ["moment", "erf", "exact"])
+@pytest.mark.parametrize("name", ["erf", "exact"])
 def test_footprints_that_the_page_cannot_draw_are_refused(name):
     with pytest.raises(ValueError, match="viewer can draw"):
         viewer.pack_scene(make_scene(), footprint=name)
@@ -338,11 +382,20 @@ def test_the_command_takes_the_footprint_of_the_file(files):
 
 
 def test_the_command_shows_what_is_near_to_what_the_page_cannot_draw(files, capsys):
-    io.save_scene(files / "moment.ply", make_scene(), io.SceneMetadata(footprint="moment:samples=4"))
-    assert run_view(files / "moment.ply", "--export", files / "out.html") == 0
-    assert '"footprint": "box:samples=16"' in (files / "out.html").read_text(encoding="utf-8")
-    expected = "footprint box:samples=16: the page cannot draw moment:samples=4 (moment.ply says so), and this is near"
+    io.save_scene(files / "exact.ply", make_scene(), io.SceneMetadata(footprint="exact"))
+    assert run_view(files / "exact.ply", "--export", files / "out.html") == 0
+    assert '"footprint": "cumulant"' in (files / "out.html").read_text(encoding="utf-8")
+    expected = "footprint cumulant: the page cannot draw exact (exact.ply says so), and this is near"
     assert capsys.readouterr().err == f"{expected}; --server shows it\n"
+
+
+def test_the_background_is_that_of_the_file(files):
+    path, out = files / "paper.ply", files / "out.html"
+    io.save_scene(path, make_scene(), io.SceneMetadata(footprint="moment", background=(1, 0.5, 0.25)))
+    assert run_view(path, "--export", out) == 0
+    assert '"background": [1.0, 0.5, 0.25]' in out.read_text(encoding="utf-8")
+    assert run_view(path, "--export", out, "--background", "white") == 0
+    assert '"background": [1.0, 1.0, 1.0]' in out.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -437,12 +490,36 @@ def test_polynomials_are_those_of_the_headers():
     minimax = re.search(r"kMinimax\[\] = \{(.*?)\}", header("lanes.h"), re.DOTALL)[1]
     ours = re.search(r"MINIMAX = \[(.*?)\]", pages.page_file("constants.js"), re.DOTALL)[1]
     assert [float(x) for x in ours.split(",") if x.strip()] == [float(x) for x in minimax.split(",")]
-    shaders, harmonics = pages.page_file("shaders.js"), header("sh.h")
-    for value in re.findall(r"\d\.\d{6,}", shaders):
+    harmonics = header("sh.h")
+    values = re.findall(r"\d\.\d{6,}", pages.page_file("sh.js"))
+    assert len(values) == 16
+    for value in values:
         assert value in harmonics, value
     cumulant = header("footprint/cumulant.h")
-    for value in re.findall(r"x \* (\d\.\d+)\)", shaders):
-        assert float(value) in {float(v) for v in re.findall(r"x \* T\((?:\d \* )?(\d\.\d+)\)", cumulant)}, value
+    theirs = {float(v) for v in re.findall(r"x \* T\((?:\d \* )?(\d\.\d+)\)", cumulant)}
+    for name in ("webgl_shaders.js", "footprint.wgsl.js"):
+        ours = re.findall(r"x \* (\d\.\d+)\)", pages.page_file(name))
+        assert len(ours) == 3 and {float(value) for value in ours} <= theirs, name
+
+
+def test_shaders_have_no_numbers_of_their_own():
+    """Whatever is not in constants.js or sh.js is a small number of a formula."""
+    for name in JAVASCRIPT:
+        if name.startswith("webgl_shaders") or (name.endswith(".wgsl.js") and name != "present.wgsl.js"):
+            found = set(re.findall(r"(?<![\w.])\d+\.\d{3,}", pages.page_file(name)))
+            assert found <= {"0.4366", "0.6240", "0.6975"}, (name, found)
+
+
+def run_node(folder, modules, script):
+    """What a script that imports these modules of the page prints, as JSON."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    for name in modules:
+        (folder / name).write_text(pages.page_file(name))
+    (folder / "package.json").write_text('{"type": "module"}')
+    (folder / "script.js").write_text(script)
+    done = subprocess.run(["node", "script.js"], cwd=folder, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 PARSE = """
@@ -456,17 +533,11 @@ console.log(JSON.stringify(names.map(parsed)));
 
 def test_the_page_finds_footprints_by_name(tmp_path):
     """As the library does, among those that it is handed."""
-    if shutil.which("node") is None:
-        pytest.skip("needs node")
     known = viewer.pack_scene(make_scene()).meta["footprints"]
     right = [*viewer.PAGE_FOOTPRINTS, "box", "point:dilation=0.5", "mip:variance=0"]
     wrong = ["box:samples=8", "mip:dilation=1", "mip:variance=-1", "mip:variance=", "analytic:=1", "exact", "", "x:y=1"]
-    (tmp_path / "constants.js").write_text(pages.page_file("constants.js"))
-    (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "names.json").write_text(json.dumps({"known": known, "names": right + wrong}))
-    (tmp_path / "parse.js").write_text(PARSE)
-    done = subprocess.run(["node", "parse.js"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    parsed = json.loads(done.stdout)
+    parsed = run_node(tmp_path, ["constants.js"], PARSE)
     for name, found in zip(right, parsed):
         footprint = ar.resolve_footprint(name)
         assert viewer.page_footprint(footprint).split("=")[0] == found["name"].split("=")[0]
@@ -476,15 +547,70 @@ def test_the_page_finds_footprints_by_name(tmp_path):
     assert parsed[len(right) :] == [f"There is no footprint '{name}'." for name in wrong]
 
 
+PACE = """
+import { Pace } from './pace.js';
+const follow = (milliseconds, frames, settled = 0) => {
+  const pace = new Pace(settled), divisors = [pace.divisor];
+  for (let k = 0; k < frames; ++k) {
+    pace.note(milliseconds(pace.divisor, k));
+    divisors.push(pace.divisor);
+  }
+  return divisors;
+};
+console.log(JSON.stringify({
+  quick: follow(() => 5, 6),
+  slow: follow(divisor => 10 + 200 / (divisor * divisor), 8),  // 60 ms at 1/2, 22 ms at 1/4
+  stubborn: follow(() => 90, 8),                               // nothing is gained
+  recovers: follow((divisor, k) => (k < 3 ? 100 / divisor : 4), 12),
+  warned: follow(divisor => 400 / (divisor * divisor), 4, 3000),  // 25 ms at 1/4
+}));
+"""
+
+
+def test_pictures_in_motion_are_as_small_as_they_must_be(tmp_path):
+    followed = run_node(tmp_path, ["pace.js"], PACE)
+    assert followed["quick"] == [1] * 7
+    assert followed["warned"] == [4] * 5
+    assert followed["slow"][-4:] == [4] * 4
+    assert followed["stubborn"][-4:] == [1] * 4
+    assert 2 in followed["recovers"] and followed["recovers"][-1] == 1
+
+
+CELLS = """
+import { cellsOf } from './constants.js';
+console.log(JSON.stringify([1, 4, 16].map(cellsOf)));
+"""
+
+
+def test_cells_tile_the_pixel_in_the_order_of_the_header(tmp_path):
+    """node() of moment.h: rows of cells, from half cells (2 k + 1 - side) / (2 side)."""
+    for side, cells in zip((1, 2, 4), run_node(tmp_path, ["constants.js"], CELLS)):
+        centres = [(2 * k + 1) / (2 * side) - 0.5 for k in range(side)]
+        assert cells == [[x, y] for y in centres for x in centres]
+
+
+def kinds_in(module, table):
+    block = pages.page_file(module).split(f"export const {table} = {{")[1].split("\n}};")[0].split("\n};")[0]
+    return set(re.findall(r"^  (\w+): ", block, re.MULTILINE))
+
+
 def test_the_page_has_the_formulas_that_headers_name():
-    """A formula is a key of KINDS in shaders.js, and pages offer every footprint whose header names one."""
-    block = pages.page_file("shaders.js").split("const KINDS = {")[1].split("\n};")[0]
-    kinds = set(re.findall(r"^  (\w+): ", block, re.MULTILINE))
+    """A formula is a key of KINDS in footprint.wgsl.js; pages offer every footprint whose header names one."""
     entries = viewer.pack_scene(make_scene()).meta["footprints"]
+    kinds = kinds_in("footprint.wgsl.js", "KINDS")
     assert kinds == {entry["kind"] for entry in entries}
     stated = {variant["name"] for variant in _C.footprints() if variant["page"] is not None}
     assert {entry["family"] for entry in entries} == stated
     assert {entry["samples"] for entry in entries} - {1} == {4, 16}  # those of HALF_NODES
+
+
+def test_without_webgpu_there_is_a_footprint_in_place_of_every_other():
+    kinds = kinds_in("webgl_shaders.js", "GL_KINDS")
+    entries = {entry["name"]: entry for entry in viewer.pack_scene(make_scene()).meta["footprints"]}
+    drawn = {name for name, entry in entries.items() if entry["samples"] == 1 and entry["kind"] in kinds}
+    assert drawn == {"point", "mip", "analytic", "cumulant", "box:samples=1"}
+    for name, entry in entries.items():
+        assert name in drawn or entry["instead"] in drawn
 
 
 @pytest.mark.parametrize("name", JAVASCRIPT)

@@ -20,6 +20,7 @@ from pages import (
     PATIENCE,
     READ_PIXELS,
     REDUCTIONS,
+    WEBGL_FOOTPRINTS,
     assert_same,
     random_scene,
     rendered,
@@ -179,7 +180,7 @@ def settled(request, firefox):
 
 
 @pytest.mark.parametrize("reduction", REDUCTIONS)
-@pytest.mark.parametrize("footprint", viewer.PAGE_FOOTPRINTS)
+@pytest.mark.parametrize("footprint", WEBGL_FOOTPRINTS)
 def test_pictures(settled, footprint, reduction):
     firefox, scene, view, background = settled
     view = view.scaled(1 / reduction)

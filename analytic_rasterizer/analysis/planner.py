@@ -27,6 +27,7 @@ from ..settings import GaussianRasterizationSettings
 from ..sh import needed_sh_degree, sh_band_bounds
 from ..stages import Splats, Stages, project, render_stages
 from . import timing
+from .affine import LIMIT, affine_error
 from .inspection import BINS, NARROW, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
 
 LADDER = sampled_footprints()  # what is tried
@@ -35,6 +36,7 @@ SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
 FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
 FINER = 1.1  # a view calls for the 3D filter if it samples so many times as finely as in training
 FINER_SHARE = 0.01  # more than this share of what it shows
+BENT_SHARE = 0.01  # of the Gaussians that a view shows: with more, their splats are said to be wrong
 SAME = 1.05  # ratio of times up to which the candidate listed first is taken
 TIMED_VIEWS = 2
 
@@ -124,6 +126,7 @@ def inspect_scene(
         _sh_finding(scene, survey, top_band, costs.get("sh")),
         _filter_finding(survey, costs.get("filter_3d")),
         _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
+        _affine_finding(scene, cameras, seen, [report.name for report in reports]),
         *_other_findings(survey, costs["outputs"]),
     )
     machine = timing.describe_machine(scene.means.device.type)
@@ -301,6 +304,20 @@ def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float)
         "rendering them too, and `shown` of the report is the mask of the others"
     )
     return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
+
+
+def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], names: list[str]) -> Finding:
+    """Whether splats are the pictures of their Gaussians: the view in which most of them are not."""
+    shares = [share(affine_error(scene, camera)[of.cpu()] > LIMIT) for camera, of in zip(cameras, seen)]
+    largest = max(shares)
+    needed = largest > BENT_SHARE
+    view = names[shares.index(largest)]
+    reason = (
+        f"the map of the camera bends over {percent(largest)} of the Gaussians that {view} shows (affine_error "
+        f" above {LIMIT}, docs/accuracy.md), which a splat cannot show"
+    )
+    advice = "pictures of narrower views" if needed else "as it is"
+    return Finding("affine picture", needed, None, None, None, advice, reason)
 
 
 def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, ...]:

@@ -1,4 +1,4 @@
-"""The command line: `python -m analytic_rasterizer COMMAND`.
+"""The command line: `python -m analytic_rasterizer COMMAND`. Without a command it says what is installed.
 
 A command is a module with two functions: `add_parser` adds its parser to the subcommands, and `run` takes the parsed
 arguments. COMMANDS lists them. A command reports what the user can correct by raising: `main` turns that into one line
@@ -7,8 +7,9 @@ on stderr and exit code 2.
 
 from __future__ import annotations
 
-from .. import __version__
+from .. import _C, __version__
 from ..footprints import ADVICE_IN_WORDS
+from ..installation import about
 from . import bake, errors, evaluate, inspect, pareto, render, tables, train, view
 from .arguments import Parser, run_command
 
@@ -32,7 +33,13 @@ def build_parser() -> Parser:
     advice = f"Footprints to take for {ADVICE_IN_WORDS}. COMMAND --help explains a command."
     parser = Parser(prog="python -m analytic_rasterizer", description=description, epilog=advice)
     parser.add_argument("--version", action="version", version=f"analytic_rasterizer {__version__}")
-    subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    parser.set_defaults(run=_say_what_is_installed)
+    subcommands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         command.add_parser(subcommands)
     return parser
+
+
+def _say_what_is_installed(_arguments: object) -> None:
+    print(about(__version__, _C.BUILT_FOR, _C.has_cuda))
+    print("python -m analytic_rasterizer --help lists the commands")

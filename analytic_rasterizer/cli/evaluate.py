@@ -11,8 +11,8 @@ from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
-from ..training.captures import IMAGES, TEST_PERIOD, Capture
-from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
+from ..training.captures import CHOICES, IMAGES, TEST_PERIOD, Capture
+from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
@@ -31,6 +31,7 @@ from .launch import add_rank_options, ranks_of
 from .scenes import color_in_words, say
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
+HEADINGS[COLOR_CORRECTED] = ("PSNR, best affine colour", "{:.2f}")  # of each picture
 SIMILAR = 0.01  # share by which widths of pictures may differ unmentioned
 
 
@@ -94,7 +95,7 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     if found.options is not None:
         try:
             source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-            reading = {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+            reading = {name: source[name] for name in ("cameras", *CHOICES) if name in source}
             named = source["scene"], source["images"], source["test_every"]
             usual = Protocol(*named, options.scales, reading, options)
         except (ValueError, KeyError, TypeError) as error:
@@ -152,8 +153,9 @@ def run_on(ranks: Ranks, args) -> None:
     pictures_folder = writable_folder(out / "evaluation")
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
+    colors = {"color_corrected": options.exposure != "none"}
     for footprint in dict.fromkeys(str(choice.footprint) for choice in choices):
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common, **colors)
         if args.pictures > 0:
             save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
@@ -209,7 +211,7 @@ def format_results(results: dict[str, dict], scales: tuple[int, ...]) -> str:
     """A row per footprint and measure, with a column per scale and one for the mean."""
     rows = []
     for footprint, measured in results.items():
-        for measure in (m for m in MEASURES if m in measured["mean"]):
+        for measure in (m for m in (*MEASURES, COLOR_CORRECTED) if m in measured["mean"]):
             heading, layout = HEADINGS[measure]
             values = [measured[key][measure] for key in (*map(str, scales), "mean")]
             rows.append([footprint, heading, *(layout.format(value) for value in values)])

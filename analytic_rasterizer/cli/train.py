@@ -15,10 +15,19 @@ from .. import io
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import Run, TrainingOptions
-from ..training.captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD
+from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
+from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.health import flag
-from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
+from ..training.options import (
+    BACKGROUNDS,
+    DENSITIES,
+    DOWNSAMPLINGS,
+    PRESETS,
+    RANDOM_BACKGROUND,
+    TIMES,
+    preset_values,
+)
 from ..training.reports import process_age
 from .arguments import add_machine_options, port, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
@@ -93,10 +102,14 @@ def add_parser(subcommands) -> None:
     add("--test-every", type=int, metavar="N", help=test_every)
     cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
     add("--cameras", metavar="NAME", help=cameras)
-    lens = "photographs with a lens are rendered with it, resampled to pinholes, or an error (default: exact)"
-    add("--lens", choices=LENS_CHOICES, help=lens)
-    missing = "pictures that are not there are an error, or left out with their cameras (default: refuse)"
-    add("--missing", choices=MISSING_CHOICES, help=missing)
+    choices = {
+        "lens": "photographs with a lens are rendered with it, resampled to pinholes, or an error",
+        "missing": "pictures that are not there are an error, or left out with their cameras",
+        "masks": "black pixels of masks do not count, or masks are ignored",
+        "alpha": "a background is seen through transparent pixels, or they do not count",
+    }
+    for name, text in choices.items():
+        add(f"--{name}", choices=CHOICES[name], help=f"{text} (default: {CHOICES[name][0]})")
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
@@ -191,6 +204,8 @@ def run_on(ranks: Ranks, args) -> bool:
         cameras=args.cameras,
         lens=args.lens,
         missing=args.missing,
+        masks=args.masks,
+        alpha=args.alpha,
         save_every=args.save_every,
         resume=args.resume,
         **length,
@@ -229,6 +244,8 @@ def finish(training: Run, complete: bool, args) -> None:
         say(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
         for scale, values in metrics.get("test", {}).items():
             name = scale if scale == "mean" else f"1/{scale}"
-            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+            best = values.get(COLOR_CORRECTED)
+            after = "" if best is None else f"; after the best affine colour of each picture: PSNR {best:.2f} dB"
+            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}{after}")
     if training.ranks.is_first:
         print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in training.phases.items()), file=sys.stderr)

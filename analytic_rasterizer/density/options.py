@@ -63,7 +63,7 @@ class GradientOptions:
 
 @dataclass(frozen=True)
 class MonteCarloOptions:
-    """When `MonteCarloDensity` moves and adds Gaussians, and how strong its noise is. The defaults are those of [MCMC].
+    """When `MonteCarloDensity` moves and adds Gaussians, and how strong its noise is.
 
     Attributes:
         densify_from: Steps before the first change.

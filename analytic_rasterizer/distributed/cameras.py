@@ -23,6 +23,7 @@ import torch.distributed as dist
 from ..autocast import way_out_of, widened, widened_settings
 from ..checks import check_tensors
 from ..effects import AUTO
+from ..seam import has_seam
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
@@ -229,6 +230,8 @@ def check_camera(settings: GaussianRasterizationSettings, name: str = "") -> Non
         raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {got}")
     if bg.shape != (3,):
         raise ValueError(f"bg must have shape (3,), got {tuple(bg.shape)}{name}")
+    if has_seam(settings):
+        raise ValueError(f"lens must not be equirectangular, which is not distributed, got it{name}")
     if isinstance(settings.effects, str) and settings.effects == AUTO:
         raise ValueError(f'effects must not be "auto", which looks at all Gaussians, got it{name}')
 

@@ -117,7 +117,9 @@ class FoundScene:
 
     @property
     def background(self) -> tuple[tuple[float, float, float], str] | None:
-        """The colour behind the scene in its training, and who says so; None where nothing does."""
+        """The colour behind the scene, in its training, and who says so; None where nothing does."""
+        if self.metadata.background is not None:
+            return self.metadata.background, self.path.name
         if self.options is not None:
             color = self.options.get("background")
             if color is None:  # of a training before options.json said it

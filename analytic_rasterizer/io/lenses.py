@@ -30,7 +30,8 @@ _OF_COLMAP: dict[str, tuple[int, Callable[[Sequence[float]], Lens | None]]] = {
     "RAD_TAN_THIN_PRISM_FISHEYE": (2, lambda k: Lens.rad_tan_fisheye(k[:6], k[6:8], k[8:])),
     "FOV": (2, lambda k: Lens.fov(k[0]) if k[0] else None),
 }
-NAMES = tuple(_OF_COLMAP)
+SPHERICAL = "EQUIRECTANGULAR"  # whose parameters are width and height of the sphere's picture, px
+NAMES = (*_OF_COLMAP, SPHERICAL)
 # What an entry of a transforms file may say of the lens; nothing, or zeros, for that of its model.
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OTHER_WORDS = ("distortion_params", "is_fisheye")
@@ -52,6 +53,10 @@ def lens_of_colmap(model: str, parameters: Sequence[float], where: str) -> tuple
     Raises:
         SceneError: A model that is not of `NAMES`; parameters that are not finite, or no lens.
     """
+    if model == SPHERICAL:
+        if not all(math.isfinite(number) and number > 0 for number in parameters):
+            raise SceneError(f"{where} must have a positive size")
+        return sphere_of(*parameters), Lens.equirectangular()
     if model not in _OF_COLMAP:
         raise SceneError(
             f"{where} is {model}; rendered are {', '.join(NAMES)}: undistort the pictures first, with COLMAP's "
@@ -65,6 +70,11 @@ def lens_of_colmap(model: str, parameters: Sequence[float], where: str) -> tuple
     return {"fx": focal[0], "fy": focal[-1], "cx": cx, "cy": cy}, lens
 
 
+def sphere_of(width: float, height: float) -> dict[str, float]:
+    """fx, fy, cx and cy of a picture of the whole sphere, px."""
+    return {"fx": width / (2 * math.pi), "fy": height / math.pi, "cx": width / 2, "cy": height / 2}
+
+
 def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
     """The lens of an entry of a nerfstudio or instant-ngp file, with what all entries share; None for a pinhole.
 
@@ -72,7 +82,11 @@ def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
     """
     said = {name: entry[name] for name in (*_COEFFICIENTS, *_OTHER_WORDS) if _says_something(entry.get(name))}
     model = entry.get("camera_model") or ("OPENCV_FISHEYE" if said.pop("is_fisheye", None) is True else "OPENCV")
-    if model not in _OF_COLMAP:
+    if model == SPHERICAL:
+        if said:
+            raise SceneError(f"{where}: {SPHERICAL} must have no coefficients, got {', '.join(said)}")
+        return Lens.equirectangular()
+    if model not in NAMES:
         raise SceneError(f"{where}: camera_model must be one of {', '.join(NAMES)}, got {model!r}")
     # COLMAP's FULL_OPENCV has k4, k5, k6 as divisors. nerfstudio's OPENCV has k4 on the polynomial of k1, k2, k3.
     known = {"OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"), FULL_OPENCV: _COEFFICIENTS}

@@ -30,19 +30,21 @@ class SceneMetadata:
             with an antialiasing filter. In an .spz, False is also what programs write that know nothing about it.
         offset: (x, y, z), world units. Positions in the world are those of the file plus this.
         comments: Other lines of text.
+        background: (r, g, b) in [0, 1], the colour that the scene is to be seen in front of.
     """
 
     footprint: str | None = None
     antialiased: bool | None = None
     offset: tuple[float, float, float] | None = None
     comments: tuple[str, ...] = ()
+    background: tuple[float, float, float] | None = None
 
     def checked(self) -> SceneMetadata:
         """The same as it is written: the footprint with all of its options, and `antialiased` as that footprint is.
 
         Raises:
-            ValueError: An unknown footprint, an offset that is not three finite numbers, or comments that are not
-                single lines of ASCII.
+            ValueError: An unknown footprint, an offset that is not three finite numbers, a background that is not
+                three numbers from 0 to 1, or comments that are not single lines of ASCII.
         """
         found = replace(self, comments=tuple(self.comments))
         for comment in found.comments:
@@ -53,6 +55,11 @@ class SceneMetadata:
             if len(offset) != 3 or not all(math.isfinite(value) for value in offset):
                 raise ValueError(f"offset must be three finite numbers, got {self.offset}")
             found = replace(found, offset=offset)
+        if found.background is not None:
+            background = tuple(float(value) for value in found.background)
+            if len(background) != 3 or not all(0 <= value <= 1 for value in background):
+                raise ValueError(f"background must be three numbers from 0 to 1, got {self.background}")
+            found = replace(found, background=background)
         if found.footprint is not None:
             footprint = resolve_footprint(found.footprint)
             found = replace(found, footprint=str(footprint), antialiased=footprint.name != DILATED)
@@ -65,6 +72,8 @@ class SceneMetadata:
             lines.append(f"{OWN} footprint {self.footprint}")
         if self.offset is not None:
             lines.append(f"{OWN} offset {' '.join(repr(value) for value in self.offset)}")
+        if self.background is not None:
+            lines.append(f"{OWN} background {' '.join(repr(value) for value in self.background)}")
         return [*lines, *self.comments]
 
     def lost(self) -> list[str]:
@@ -75,6 +84,8 @@ class SceneMetadata:
             lost.append(f"the footprint (give --footprint {chosen} where it is rendered)")
         if self.offset is not None and any(self.offset):
             lost.append(f"the offset {self.offset} of its positions")
+        if self.background is not None:
+            lost.append(f"the background {self.background}")
         return lost
 
 
@@ -88,7 +99,7 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
             fields["antialiased"] = words[1] == "mip"
         elif words in (["antialiased", "0"], ["antialiased", "1"]):  # Postshot
             fields["antialiased"] = words[1] == "1"
-        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"]):
+        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"], ["background"]):
             _, name, *values = words
             try:
                 value = " ".join(values) if name == "footprint" else tuple(map(float, values))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -206,7 +207,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
     elif kind == "spz":
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
-        lines = SceneMetadata(metadata.footprint, None, metadata.offset, metadata.comments).lines()
+        lines = replace(metadata, antialiased=None).lines()
         write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
     else:
         content = splat.to_splat(fields)

@@ -46,7 +46,7 @@ class Header(NamedTuple):
 
 
 def read_spz(path: Path) -> dict[str, np.ndarray]:
-    """The parameters of an .spz of version 1 to 4, by the names of the fields of `Gaussians`.
+    """The parameters of an .spz of version 2 to 4, by the names of the fields of `Gaussians`.
 
     Raises SceneError, which names the file, for a broken one; ImportError without gsply, or for version 4 zstandard.
     """

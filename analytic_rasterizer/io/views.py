@@ -13,7 +13,7 @@ import torch
 
 from ..camera import View
 from .common import SceneError, first_line, opened_picture
-from .lenses import lens_from_json, lens_of_transforms, lens_to_json
+from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, sphere_of
 from .pictures import PictureFiles
 from .writing import write_text
 
@@ -135,10 +135,15 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
             f"{where}: no image size: expected 'w' and 'h', a picture at 'file_path', "
             "or a size given by the caller (--size)"
         )
-    fx = _focal(entry, "fl_x", "camera_angle_x", width, where)
-    if fx is None:
-        raise SceneError(f"{where}: expected 'fl_x' or 'camera_angle_x'")
-    fy = _focal(entry, "fl_y", "camera_angle_y", height, where)
+    if entry.get("camera_model") == SPHERICAL:
+        intrinsics = sphere_of(width, height)
+    else:
+        fx = _focal(entry, "fl_x", "camera_angle_x", width, where)
+        if fx is None:
+            raise SceneError(f"{where}: expected 'fl_x' or 'camera_angle_x'")
+        fy = _focal(entry, "fl_y", "camera_angle_y", height, where)
+        intrinsics = {"fx": fx, "fy": fx if fy is None else fy}
+        intrinsics |= {name: _optional(entry, name, where) for name in ("cx", "cy")}
     matrix = f"{where}: transform_matrix"
     c2w = checked_pose(_get(entry, "transform_matrix", where), matrix)
     c2w[:3, 1:3] *= -1  # OpenGL looks along -z with y up
@@ -146,12 +151,9 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
         name=_picture_name(entry.get("file_path", ""), i),
         width=width,
         height=height,
-        fx=fx,
-        fy=fx if fy is None else fy,
         w2c=torch.linalg.inv(c2w),
-        cx=_optional(entry, "cx", where),
-        cy=_optional(entry, "cy", where),
         lens=lens,
+        **intrinsics,
     )
 
 

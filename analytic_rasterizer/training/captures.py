@@ -11,7 +11,7 @@ from .. import io
 from ..effects import NEAR
 from . import colmap
 from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance
-from .layouts import BLACK, WHITE, Capture, Photograph, has_splits, read_layout
+from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, has_splits, read_layout
 from .placement import offset_of
 from .undistortion import window_of
 
@@ -19,8 +19,13 @@ __all__ = ["BLACK", "WHITE", "Capture", "Photograph", "load_capture"]
 
 IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
-LENS_CHOICES = ("exact", "undistort", "refuse")
-MISSING_CHOICES = ("refuse", "skip")
+CHOICES = {
+    "lens": ("keep", "undistort", "refuse"),
+    "missing": ("refuse", "skip"),
+    "masks": ("auto", "none"),
+    "alpha": ("background", "mask"),
+}
+"""Of arguments of `load_capture`, which are options of `train` too; the first is the default."""
 SEARCH_DEPTH = 3  # folders below SCENE where an error looks for reconstructions
 
 
@@ -30,8 +35,10 @@ def load_capture(
     test_every: int = TEST_PERIOD,
     *,
     cameras: str | None = None,
-    lens: str = "exact",
+    lens: str = "keep",
     missing: str = "refuse",
+    masks: str = "auto",
+    alpha: str = "background",
     offset: tuple[float, float, float] | None = None,
 ) -> Capture:
     """Reads the cameras of a folder, and looks whether all of its pictures are there.
@@ -47,35 +54,45 @@ def load_capture(
             among them; 0 for none.
         cameras: The file or folder in `folder` to read the cameras from, such as "transforms.json" or "sparse/1"; None:
             chosen as above.
-        lens: "exact": the renderer has the lenses of the photographs; "undistort": photographs of cameras with a lens
+        lens: "keep": the renderer has the lenses of the photographs; "undistort": photographs of cameras with a lens
             are resampled to pinholes; "refuse": they are an error.
         missing: "refuse": pictures that are not there are an error; "skip": their cameras are left out.
+        masks: "auto": black pixels of masks do not count, neither in training nor in tests. Masks are pictures in
+            COLMAP's folder `masks` with the name of the photograph, and .png after it or not, or nerfstudio's
+            mask_path. "none": masks are ignored.
+        alpha: "background": a background is seen through transparent pixels; "mask": they do not count.
         offset: What to take off all positions, so that they are those of a scene with this offset. None: what
             `offset_of` finds, which is nothing unless coordinates are far from zero.
 
-    Warns of masks, which are ignored, of photographs that are left out because their cameras are far from all others,
-    and of points so near to the cameras that they are not drawn.
+    Warns of masks elsewhere, which are ignored, of photographs that are left out because their cameras are far from all
+    others, and of points so near to the cameras that they are not drawn.
 
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens
             that cannot be undistorted.
         OSError: A file that cannot be read.
-        ValueError: test_every is negative or 1; no such `lens` or `missing`.
+        ValueError: test_every is negative or 1; no such `lens`, `missing`, `masks` or `alpha`.
     """
     if test_every < 0 or test_every == 1:
         raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
-    for name, value, choices in (("lens", lens, LENS_CHOICES), ("missing", missing, MISSING_CHOICES)):
-        if value not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value}")
+    for name, value in {"lens": lens, "missing": missing, "masks": masks, "alpha": alpha}.items():
+        if value not in CHOICES[name]:
+            raise ValueError(f"{name} must be one of {', '.join(CHOICES[name])}, got {value}")
     folder = Path(folder)
     if not folder.is_dir():
         raise io.SceneError(f"{folder}: no such folder")
     capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras, missing))
     check_capture(folder, capture)
-    if capture.masks:
+    if capture.ignored_masks and masks == "auto":
         warnings.warn(
-            f"{folder}: the masks of {capture.masks} pictures are ignored, all of their pixels count", stacklevel=2
+            f"{folder}: {capture.ignored_masks} masks are ignored, all pixels count: masks of photographs belong in "
+            f"{folder / MASKS}, or mask_path names them",
+            stacklevel=2,
         )
+    if masks == "none":
+        capture = _each(capture, mask=None)
+    if alpha == "mask":
+        capture = _each(capture, alpha_is_mask=True)
     photographs = [*capture.train, *capture.test]
     _warn_of_near(folder, photographs, capture.points)
     distorted = [item for item in photographs if item.view.lens is not None]
@@ -86,6 +103,9 @@ def load_capture(
             "first"
         )
     notes = list(capture.notes)
+    masked = sum(item.mask is not None for item in photographs)
+    if masked:
+        notes.append(f"{masked} of {len(photographs)} photographs have a mask, whose black pixels do not count")
     if distorted and lens == "undistort":
         _check_windows(folder, distorted)
         notes.append(_about_lost_area(distorted, len(photographs)))
@@ -246,6 +266,12 @@ def _warn_of_near(
             f"drawn: scale the capture up, with COLMAP's model_transformer for example",
             stacklevel=3,
         )
+
+
+def _each(capture: Capture, **changes) -> Capture:
+    """The capture with other fields of every photograph."""
+    train, test = ([item._replace(**changes) for item in items] for items in (capture.train, capture.test))
+    return capture._replace(train=train, test=test)
 
 
 def _check_windows(folder: Path, distorted: list[Photograph]) -> None:

@@ -14,23 +14,30 @@ from torch import Tensor
 from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
-from ..losses import ssim
+from ..losses import counted, ssim
 from ..settings import GaussianRasterizationSettings
+from .exposure import best_exposure, corrected
 from .model import render, render_together
 from .pictures import Pictures
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors
 MEASURES = ("psnr", "ssim", "lpips")
+COLOR_CORRECTED = "psnr_color_corrected"
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
-def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8."""
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8.
+
+    With a mask (H, W) both images are multiplied by it already, and its sum is what the mean is over.
+    """
     if target.dtype == torch.uint8:
         target = target.to(image.dtype) / 255
-    return -10 * (image.clamp(0, 1) - target).square().mean().log10()
+    error = (image.clamp(0, 1) - target).square()
+    mean_error = error.mean() if mask is None else error.sum() / (len(error) * mask.square().sum())
+    return -10 * mean_error.log10()
 
 
 def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False) -> Perceptual:
@@ -69,6 +76,7 @@ def evaluate(
     lpips: Perceptual | None = None,
     *,
     supersampling: int = 1,
+    color_corrected: bool = False,
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> dict[str, dict]:
@@ -84,7 +92,8 @@ def evaluate(
         **options: Further settings.
 
     Returns:
-        By scale, as text, and "mean" over scales: {"psnr", "ssim", "lpips"}; scales also have "views", a list with
+        Over what counts where pictures have masks; LPIPS of pictures that are black elsewhere. By scale, as text, and
+        "mean" over scales: {"psnr", "ssim", "lpips"}; scales also have "views", a list with
         the same for each view.
 
     Raises:
@@ -92,22 +101,33 @@ def evaluate(
     """
     if not pictures.views:
         raise ValueError("pictures must have at least one view, got none")
+    names = [*MEASURES[: 2 if lpips is None else 3], *([COLOR_CORRECTED] if color_corrected else [])]
     gaussians = scene.arguments()
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         measured = {}
         for view, image in rendered(gaussians, settings, supersampling, ranks):
-            image, truth = image.clamp(0, 1), pictures.truth(scale, view)
-            values = [psnr(image, truth), ssim(image, truth)]
+            mask = pictures.mask(scale, view)
+            image, truth = counted(image.clamp(0, 1), pictures.truth(scale, view), mask)
+            values = [psnr(image, truth, mask), _mean_ssim(image, truth, mask)]
             if lpips is not None:
                 values.append(lpips(image, truth).reshape(()))
+            if color_corrected:
+                best = corrected(image, best_exposure(image, truth, mask))
+                values.append(psnr(best if mask is None else best * mask, truth, mask))
             measured[view] = torch.stack(values)
         own = dict(zip(measured, torch.stack(list(measured.values())).tolist() if measured else []))
         of_views = {view: values for of_rank in ranks.exchange(own) for view, values in of_rank.items()}
-        views = [dict(zip(MEASURES, of_views[view])) for view in range(len(settings))]
+        views = [dict(zip(names, of_views[view])) for view in range(len(settings))]
         results[str(scale)] = _means(views) | {"views": views}
     results["mean"] = _means([{k: v for k, v in of_scale.items() if k != "views"} for of_scale in results.values()])
     return results
+
+
+def _mean_ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    if mask is None:
+        return ssim(image, target)
+    return (ssim(image, target, "none") * mask).sum() / (len(image) * mask.sum())
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..lens import WIDE
+from ..lens import SPHERE, WIDE
 from .layouts import Photograph
-from .pictures import read_file
+from .pictures import read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
 MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and points behind which they may be hidden
@@ -136,6 +136,8 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     if not len(points):
         return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7))
     planes = rgba.permute(2, 0, 1)[None].float() / 255
+    if item.mask is not None:  # what does not count is not looked at
+        planes[0, 3] *= read_mask(item.mask, rgba.shape[1], rgba.shape[0]).float() / 255
     reduction = -(-max(rgba.shape[:2]) // LARGEST)
     planes = functional.avg_pool2d(planes, reduction) if reduction > 1 else planes
     height, width = planes.shape[2:]
@@ -143,7 +145,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
     pixels = view.pixels_of(in_camera)
     inside = ((pixels >= 0) & (pixels < pixels.new_tensor([width, height]))).all(1)
-    wide = view.lens is not None and view.lens.model in WIDE
+    wide = view.lens is not None and view.lens.model in (*WIDE, SPHERE)
     depth = in_camera.norm(dim=1) if wide else in_camera[:, 2]
     visible = inside.nonzero()[:, 0]
     visible = visible[_in_front(pixels[visible], depth[visible], width, height) & chosen[visible]]

@@ -17,6 +17,7 @@ from ..io.writing import as_json, write_json, write_safely, write_text
 
 CHECKPOINT = "checkpoint.pt"
 MIP_SCENE = "point_cloud_mip.ply"
+EXPOSURES = "exposures.json"  # as of 3DGS: 3x4 by the name of a photograph
 METRICS, LOG = "metrics.json", "log.jsonl"
 CHECKPOINT_FORMAT = 3
 

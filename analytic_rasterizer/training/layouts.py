@@ -21,6 +21,7 @@ from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
 from ..io.views import checked_pixels, checked_pose, checked_positive, read_views
 from . import colmap
 
+MASKS = "masks"  # COLMAP's folder of them, beside that of the pictures
 MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
 
 
@@ -31,11 +32,15 @@ class Photograph(NamedTuple):
         view: The camera, of the size of the whole picture.
         files: By scale, where 2 is half the size. 1 is always there, and makes the scales that are not.
         undistort: Whether `load_pictures` resamples the picture to that of a pinhole.
+        mask: The file of its mask, whose black pixels do not count; None: all pixels count.
+        alpha_is_mask: Whether transparent pixels do not count; otherwise a background is seen through them.
     """
 
     view: io.View
     files: dict[int, Path]
     undistort: bool = False
+    mask: Path | None = None
+    alpha_is_mask: bool = False
 
 
 class Capture(NamedTuple):
@@ -49,7 +54,7 @@ class Capture(NamedTuple):
             the same.
         starts_in_view: Whether random points belong in the views, where there are no others, or in the cube of
             NeRF-synthetic.
-        masks: How many pictures have a mask, which is ignored.
+        ignored_masks: How many files of masks there are that belong to no convention.
         notes: Sentences of what was chosen, for the user.
         missing: Pictures without a file, whose photographs were left out.
         source: The file or folder that the cameras come from; None: unknown.
@@ -61,7 +66,7 @@ class Capture(NamedTuple):
     points: tuple[Tensor, Tensor] | None
     offset: tuple[float, float, float] | None = None
     starts_in_view: bool = False
-    masks: int = 0
+    ignored_masks: int = 0
     notes: tuple[str, ...] = ()
     missing: tuple[Path, ...] = ()
     source: Path | None = None
@@ -98,16 +103,22 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
         expected = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
         raise io.SceneError(f"{folder / images}: no such folder; {expected}")
     files = PictureFiles(folder / images)
-    items = [Photograph(item.view, {1: files.find(item.name)}) for item in registered]
+    masks = PictureFiles(folder / MASKS)
+    items = [Photograph(item.view, {1: files.find(item.name)}, mask=_mask_of(masks, item.name)) for item in registered]
     points = colmap.load_points(sparse)
-    masks = _count_masks(folder, folder / images)
     return Capture(
         *_split(folder, items, test_every),
         BLACK,
         initial_points(sparse) if points is None else points,
         starts_in_view=True,
-        masks=masks,
+        ignored_masks=0 if any(item.mask for item in items) else _count_masks(folder, folder / images),
     )
+
+
+def _mask_of(masks: PictureFiles, name: str) -> Path | None:
+    """The mask of a picture as COLMAP names it, NAME.png, or of the same name; None where there is none."""
+    found = (masks.find(candidate) for candidate in (f"{name}.png", name))
+    return next((path for path in found if path.is_file()), None)
 
 
 def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
@@ -119,8 +130,13 @@ def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
     if not isinstance(data, dict):
         raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
     files = PictureFiles(path.parent)
-    frames = zip(views, data["frames"])
-    return [Photograph(view, {1: files.find(str(frame.get("file_path", "")))}) for view, frame in frames], data
+    found = []
+    for i, (view, frame) in enumerate(zip(views, data["frames"])):
+        mask = frame.get("mask_path")
+        if mask is not None and not (isinstance(mask, str) and (mask := files.find(mask)).is_file()):
+            raise io.SceneError(f"{path}: frame {i}: mask_path must name a picture beside the file, got {mask!s}")
+        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, mask=mask))
+    return found, data
 
 
 def nerfstudio(path: Path, test_every: int) -> Capture:
@@ -143,7 +159,7 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
     else:
         raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
     items.sort(key=lambda item: str(item.files[1]))
-    masks = sum(frame.get("mask_path") is not None for frame in data["frames"]) or _count_masks(path.parent)
+    ignored = 0 if any(item.mask for item in items) else _count_masks(path.parent)
     pictures, lists = PictureFiles(path.parent), {}
     files = [os.path.normpath(item.files[1]) for item in items]
     for split in ("train", "val", "test"):
@@ -160,7 +176,7 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
         splits = [[item for file, item in zip(files, items) if file in names] for names in (train, test)]
     else:
         splits = _split(path.parent, items, test_every)
-    return Capture(*splits, BLACK, points, starts_in_view=True, masks=masks)
+    return Capture(*splits, BLACK, points, starts_in_view=True, ignored_masks=ignored)
 
 
 def has_splits(path: Path) -> bool:

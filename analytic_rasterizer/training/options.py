@@ -12,6 +12,7 @@ from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.common import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
+EXPOSURES = ("none", "affine")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 RANDOM_BACKGROUND = "random"
 
@@ -103,6 +104,8 @@ class TrainingOptions:
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
+        exposure: "affine": learn a colour correction (3x4) for each training photograph, for captures whose exposure or
+            white balance varies. It is applied before the loss; the scene has no correction. "none": none.
         seed: Of the starting points, the order of the pictures, and everything else that is drawn; -2^39 to 2^40 - 1.
         random_points: Gaussians at the start where the capture has no points; not more than `max_gaussians`. 0:
             100,000, or `max_gaussians` where that is less.
@@ -166,6 +169,7 @@ class TrainingOptions:
     sh_every: int = 1000
     background: str = ""
     filter_3d: bool = False
+    exposure: str = "none"
     seed: int = 0
     random_points: int = 0
     ssim_weight: float = 0.2
@@ -226,6 +230,7 @@ class TrainingOptions:
         _check("background", self.background in known, f"one of {', '.join(known[1:])}", self.background)
         expected = f"one of {', '.join(DOWNSAMPLINGS)}"
         _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
+        _check("exposure", self.exposure in EXPOSURES, f"one of {', '.join(EXPOSURES)}", self.exposure)
         _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
         limited = self.density != "mcmc" or self.max_gaussians > 0
         _check(

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from .. import io
-from ..lens import WIDE
 from .extent import ROUNDING, places_of
 
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
@@ -61,7 +60,7 @@ def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor,
         of_view = chosen == i
         rays[of_view] = views[i].rays_of(pixels[of_view])
     # Depths are z, of wide lenses distances.
-    wide = torch.tensor([v.lens is not None and v.lens.model in WIDE for v in views])[chosen]
+    wide = torch.tensor([v.lens is not None and v.lens.orders_by_distance for v in views])[chosen]
     positions = rays * (z / torch.where(wide, 1.0, rays[:, 2]))[:, None]
     # Where a lens shows nothing, a point is ahead.
     positions = torch.where(positions.isfinite(), positions, torch.stack([0 * z, 0 * z, z], 1))

@@ -163,7 +163,7 @@ def plan_capture(
         _intervals(evidence),
         _scales(evidence, kept),
         _blur(evidence, looked_at),
-        _masks(capture, len(items)),
+        _masks(capture, items),
         _alpha(evidence, looked_at),
         *_files([(item, headers[item.files[1]]) for item in items]),
         _missing(capture, folder),
@@ -214,10 +214,10 @@ def _lens(items: list[Photograph]) -> Finding:
     which = f"{len(with_lens)} of {len(items)} photographs have a lens ({models})"
     if math.isinf(largest):
         reason = f"{which}, and show more than a half space, which no pinhole does"
-        return Finding("lens", None, "px", YES, "--lens exact", reason)
+        return Finding("lens", None, "px", YES, "--lens keep", reason)
     needed = largest > LENS
     reason = f"is the largest displacement from a pinhole; {which}"
-    return Finding("lens", largest, "px", YES if needed else NO, "--lens exact" if needed else "", reason)
+    return Finding("lens", largest, "px", YES if needed else NO, "--lens keep" if needed else "", reason)
 
 
 def _intervals(evidence: Evidence) -> Finding:
@@ -329,9 +329,13 @@ def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
 # ------------------------------------------------------------------------------------ files
 
 
-def _masks(capture: Capture, count: int) -> Finding:
-    verdict, option = (YES, "--masks auto") if capture.masks else (NO, "")
-    return Finding("masks", capture.masks, "masks", verdict, option, f"for {count} photographs")
+def _masks(capture: Capture, items: list[Photograph]) -> Finding:
+    masked = sum(item.mask is not None for item in items)
+    verdict, option = (YES, "--masks auto") if masked else (NO, "")
+    reason = f"of {len(items)} have a mask"
+    if capture.ignored_masks:
+        reason += f"; {capture.ignored_masks} files of masks belong to no convention, and are ignored"
+    return Finding("masks", masked, "photographs", verdict, option, reason)
 
 
 def _missing(capture: Capture, folder: Path) -> Finding:

@@ -23,6 +23,7 @@ from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
     CHECKPOINT,
+    EXPOSURES,
     LOG,
     METRICS,
     MIP_SCENE,
@@ -64,8 +65,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every, cameras, lens, missing: As `load_capture`; None: as is usual there. With `resume` None, or
-            the same as when the training began.
+        images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
+            `resume` None, or the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -101,6 +102,8 @@ class Run:
         cameras: str | None = None,
         lens: str | None = None,
         missing: str | None = None,
+        masks: str | None = None,
+        alpha: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         iterations: int | None = None,
@@ -122,9 +125,11 @@ class Run:
             stored = TrainingOptions.from_dict(state["options"])
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
+        if ranks.world > 1 and self.options.exposure != "none":
+            raise ValueError(f"exposure must be none for {ranks.world} processes, got {self.options.exposure}")
         # Where the scene is, from wherever `evaluate` is called.
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
-        given |= {"cameras": cameras, "lens": lens, "missing": missing}
+        given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
         self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
         self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
         self.source["offset"] = self.capture.offset
@@ -271,6 +276,9 @@ class Run:
             scene = self._whole(self.trainer.scene(), SCENE)
             if self.ranks.is_first:
                 write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
+                if self.trainer.exposures is not None:
+                    names = [view.name for view in self.trainer.pictures.views]
+                    write_json(self.out / EXPOSURES, dict(zip(names, self.trainer.exposures.matrices.tolist())))
         self.save()
         if self.board is not None:
             self.board.close()
@@ -379,6 +387,7 @@ class Run:
                 background = background_of(self.options, self.capture.background) or self.capture.background
                 pictures = self._load(self.capture.test, background)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
+                common["color_corrected"] = self.options.exposure != "none"
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
         metrics["phases"] = self.ranks.from_first(phases)

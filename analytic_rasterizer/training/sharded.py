@@ -21,7 +21,7 @@ from torch import Tensor
 from ..distributed import OwnSplats
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
-from ..losses import l1_ssim
+from ..losses import counted, l1_ssim
 from ..optim import MOMENTS
 from .extent import extent_of
 from .model import render_together
@@ -86,7 +86,7 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None]:
+    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None, dict[int, Tensor]]:
         """This rank's part of the loss, whose sum over the ranks is the loss of the step; and the rest as in `Trainer`.
 
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
@@ -104,8 +104,9 @@ class ShardedTrainer(Trainer):
         for rendering in batch.renderings:
             picture = shown[rendering.camera]
             truth = self.pictures.target(picture.scale, picture.view, picture.background)
-            loss = loss + l1_ssim(rendering.image, truth, options.ssim_weight) / len(shown)
-            self.last = rendering.image.detach(), truth
+            mask = self.pictures.mask(picture.scale, picture.view)
+            loss = loss + l1_ssim(rendering.image, truth, options.ssim_weight, mask) / len(shown)
+            self.last = counted(rendering.image.detach(), truth, mask)
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
             loss = loss + opacity_weight * gaussians["opacities"].sum() / batch.count
@@ -118,7 +119,7 @@ class ShardedTrainer(Trainer):
             if self._watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
-        return loss, seen, rows
+        return loss, seen, rows, {}
 
     def _visible(self, shard: Sequence[OwnSplats]) -> Tensor:
         """Which Gaussians of this rank at least one of the pictures shows, (P,) bool. Waits for no device."""

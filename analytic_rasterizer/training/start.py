@@ -12,7 +12,7 @@ import torch
 
 from .. import io
 from ..gaussians import Gaussians
-from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, load_capture
+from .captures import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture
 from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
@@ -30,7 +30,7 @@ def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, 
     Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
     """
     usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
-    usual |= {"lens": LENS_CHOICES[0], "missing": MISSING_CHOICES[0]}
+    usual |= {name: choices[0] for name, choices in CHOICES.items()}
     if state is not None:
         # Those of earlier versions have no points: nobody knows them.
         usual |= {"points": given["points"]} | {
@@ -55,7 +55,7 @@ def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
     Where it has an offset, also None, positions are relative to that.
     """
     arguments = {"images": source["images"], "test_every": source["test_every"]}
-    arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+    arguments |= {name: source[name] for name in ("cameras", *CHOICES) if name in source}
     return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
 
 

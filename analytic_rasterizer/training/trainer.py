@@ -18,9 +18,11 @@ from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
-from ..losses import l1_ssim
+from ..lens import SPHERE
+from ..losses import counted, l1_ssim
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
+from .exposure import Exposures, corrected
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
 from .model import random_points, render
@@ -81,7 +83,7 @@ class Trainer:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
-        last: Picture and target (`Pictures.target`) of the last step, for looking at.
+        last: Picture and target (`Pictures.target`) of the last step, both black where nothing counts.
         dropped: Gaussians that were taken away because a number of theirs had left float32.
         warnings: Sentences for the user; who has told them empties the list.
     """
@@ -115,6 +117,7 @@ class Trainer:
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
+        self.exposures = Exposures(len(pictures.views), self.device) if options.exposure == "affine" else None
         self.filter_3d: Tensor | None = None
         self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
         self.losses: list[Tensor] = []
@@ -212,6 +215,8 @@ class Trainer:
         """Whether the loss of a step is that of one picture of all Gaussians, and nothing else."""
         options = self.options
         one = self.ranks.world == 1 and options.pictures_per_step == 1
+        # Which is rendered from the stages.
+        one = one and not any(view.lens is not None and view.lens.model == SPHERE for view in self.pictures.views)
         return one and options.supersampling == 1 and not options.filter_3d and not any(options.regularizers)
 
     def _set_rates(self) -> None:
@@ -245,12 +250,14 @@ class Trainer:
 
         Gradients of the loss are those of the parameters, and density control has seen them.
         """
-        loss, seen, rows = self._loss()
+        loss, seen, rows, exposures = self._loss()
         # In this thread: otherwise one of the device's does it, and handing over and back takes longer than the kernels
         # of a small picture.
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward(self.one)
         self._observe(seen)
+        if self.exposures is not None:
+            self.exposures.update({view: leaf.grad for view, leaf in exposures.items()}, self.progress.share)
         return loss.detach(), rows
 
     @torch.no_grad()
@@ -260,11 +267,15 @@ class Trainer:
         gaussians, density = self.gaussians, self.density
         columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
+        mask = self.pictures.mask(shown.scale, shown.view)
+        exposure = None if self.exposures is None else self.exposures.matrices[shown.view]
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
             mean_columns=columns,
             target=truth,
             dL_dloss=self.one,
+            exposure=exposure,
+            mask=mask,
             ssim_weight=self.options.ssim_weight,
             bg=shown.settings.bg,
             **self._camera(shown),
@@ -272,8 +283,10 @@ class Trainer:
         for field, gradient in zip(gaussians, gradients):
             field.grad = gradient
         if columns:
-            density.observe_gradients(gradients[-1], radii)
-        self.last = image, truth
+            density.observe_gradients(gradients[len(gaussians)], radii)
+        if self.exposures is not None:
+            self.exposures.update({shown.view: gradients[-1]}, self.progress.share)
+        self.last = counted(corrected(image, exposure), truth, mask)
         return loss, radii > 0 if self.options.sparse_adam else None
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
@@ -284,18 +297,22 @@ class Trainer:
             self._cameras[shown.scale, shown.view] = camera
         return camera
 
-    def _loss(self) -> tuple[Tensor, Any, Tensor | None]:
-        """The loss of the next step, what `_observe` takes, and with `sparse_adam` which Gaussians a picture shows."""
+    def _loss(self) -> tuple[Tensor, Any, Tensor | None, dict[int, Tensor]]:
+        """The loss of the next step, what `_observe` takes, with `sparse_adam` which Gaussians a picture shows, and the
+        exposures of the pictures as leaves, by view."""
         options = self.options
         gaussians = self.gaussians.arguments()
-        losses, seen = [], []
+        losses, seen, exposures = [], [], {}
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf() if self._watches(scale) else None
             image, radii = render(gaussians, settings, leaf, options.supersampling)
-            truth = self.pictures.target(scale, view, background)
-            losses.append(l1_ssim(image, truth, options.ssim_weight))
+            truth, mask = self.pictures.target(scale, view, background), self.pictures.mask(scale, view)
+            if self.exposures is not None:
+                leaf_of_view = self.exposures.matrices[view].clone().requires_grad_()
+                image = corrected(image, exposures.setdefault(view, leaf_of_view))
+            losses.append(l1_ssim(image, truth, options.ssim_weight, mask))
             seen.append((leaf, radii))
-            self.last = image.detach(), truth
+            self.last = counted(image.detach(), truth, mask)
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
@@ -303,7 +320,7 @@ class Trainer:
         if scale_weight:
             loss = loss + scale_weight * gaussians["scales"].mean()
         rows = torch.stack([radii > 0 for _, radii in seen]).any(0) if options.sparse_adam else None
-        return loss, seen, rows
+        return loss, seen, rows, exposures
 
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
@@ -371,6 +388,7 @@ class Trainer:
             "progress": self.progress.state_dict(),
             "generator": self.generator.get_state(),
             "filter_3d": self.filter_3d,
+            "exposures": None if self.exposures is None else self.exposures.state_dict(),
             "extent": self.extent,
             "dropped": self.dropped,
         }
@@ -387,6 +405,8 @@ class Trainer:
         self.progress.load_state_dict(state["progress"])
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
+        if self.exposures is not None:
+            self.exposures.load_state_dict(state["exposures"])
         self.losses, self.last = [], None
         # Checkpoints of earlier versions have neither.
         self.extent = self.density.extent = state.get("extent", self.extent)

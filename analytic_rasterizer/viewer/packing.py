@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +12,20 @@ import torch
 from .. import io
 from ..footprints import (
     DILATED,
+    FASTEST,
     NEAREST_TO_EXACT,
     PAPER,
+    RECOMMENDED,
     Footprint,
     footprint_variants,
     get_default_footprint,
     resolve_footprint,
-    sampled_footprints,
     stated,
 )
 from ..gaussians import Gaussians
+
+MOVING = "moving"
+"""kPage of footprints whose samples move."""
 
 
 def _page_entry(name: str) -> dict[str, Any]:
@@ -37,6 +42,7 @@ def _page_entry(name: str) -> dict[str, Any]:
         "samples": samples,
         "variance": of_header["variance"],
         "option": of_header["option"] if of_header["value"] is None else None,
+        "instead": FASTEST if samples > 1 or of_header["page"] == MOVING else None,
     }
 
 
@@ -48,6 +54,14 @@ MAX_SH_DEGREE = 3
 GEOMETRY_WIDTH = 12
 """Numbers of a Gaussian in `PackedScene.geometry`."""
 LARGEST_HALF = 65504.0
+Z_IS_UP = 3.0
+"""How much more than y, in what faces it and in flatness together, the axis z must have to be up; see `upright`."""
+PICTURE = 0.95
+"""The part of a picture, by area, that faces its viewer."""
+DOWN = math.radians(15)
+"""How far a camera without views looks down: it stands above the floor."""
+MARGIN = 1.3
+"""How much larger than the scene's radius the picture of such a camera is."""
 DEFAULT_SIZE = (1280, 720)
 DEFAULT_FOCAL = 1100.0  # px: a vertical field of view of 36 degrees in a picture of the default size
 
@@ -61,8 +75,9 @@ class PackedScene:
             cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
             and up (a unit vector). `footprints` is what the page offers: name, text for people, family (the name
             without options) and whether it is the family's default, kind (kPage of its header), samples, variance of
-            its Gaussians [px^2], and the name of its option where that is another variance. `compared` are two of
-            their names, what the key C compares with.
+            its Gaussians [px^2], and the name of its option where that is another variance. `instead` is what is drawn
+            while the camera moves, and where there is no WebGPU; null: the footprint itself. `compared` are names of
+            footprints that the key C compares with: the first that can be drawn and is not chosen.
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
@@ -103,11 +118,7 @@ def nearest_page_footprint(footprint: Footprint) -> Footprint:
         page_footprint(footprint)
         return footprint
     except PageFootprintError:
-        if str(footprint) not in sampled_footprints():
-            return resolve_footprint(NEAREST_TO_EXACT)
-        # As many samples that move are as near as more that do not.
-        drawn = [resolve_footprint(name) for name in sampled_footprints() if name in PAGE_FOOTPRINTS]
-        return next((other for other in drawn if other.samples > footprint.samples), drawn[-1])
+        return resolve_footprint(NEAREST_TO_EXACT)
 
 
 def pack_scene(
@@ -154,19 +165,23 @@ def pack_scene(
     harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
 
     center, radius = extent(scene)
-    views = views or [overview(center, radius)]
+    if views:
+        up = mean_up(views)
+    else:
+        axis, ahead, down = upright(scene, center, radius)
+        views, up = [overview(center, radius, axis, ahead, down)], axis.tolist()
     meta = {
         "name": name,
         "count": count,
         "sh_degree": scene.sh_degree,
         "footprint": chosen_name,
         "footprints": list(PAGE_ENTRIES),
-        "compared": [DILATED, PAPER],
+        "compared": [DILATED, RECOMMENDED, PAPER],
         "background": [float(value) for value in background],
         "views": [_view_entry(view) for view in views],
         "center": center.tolist(),
         "radius": radius,
-        "up": mean_up(views),
+        "up": up,
     }
     return PackedScene(meta, geometry.numpy().astype("<f4").tobytes(), harmonics.numpy().astype("<f2").tobytes())
 
@@ -190,17 +205,59 @@ def extent(scene: Gaussians) -> tuple[torch.Tensor, float]:
     return center, max(distance.quantile(0.8).item(), 2 * largest, 1e-3)
 
 
-def overview(center: torch.Tensor, radius: float) -> io.View:
-    """A camera that looks along +z at the centre, with most of the scene in the picture."""
+def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """The directions, float64 (3,), that are probably up in a scene and away from a viewer who stands before it, and
+    the angle by which this viewer looks down, from above the floor.
+
+    Two conventions are common: -y is up where photographs were taken (COLMAP), +z in models (Blender). Scenes in which
+    z is up are flat along z, and have their floors across it. What faces z everywhere is a picture: it hangs, and is
+    looked at from -z.
+    """
+    step = max(1, len(scene.means) // 100_000)
+    means, scales, opacities = scene.means[::step].double(), scene.scales[::step].double(), scene.opacities[::step]
+    w, x, y, z = _unit_quaternions(scene.rotations[::step]).double().unbind(1)
+    # Rows y and z of the rotations: column k is what axis k of a Gaussian has of that direction.
+    of_y = torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
+    of_z = torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    thinnest = scales.argmin(dim=1, keepdim=True)
+    small, middle, large = scales.sort(dim=1).values.unbind(1)
+    near = (means - center).norm(dim=1) < 1.5 * radius
+    axes = torch.eye(3, dtype=torch.float64, device="cpu")
+    if not near.any():
+        return -axes[1], axes[2], 0.0
+    area = near * opacities[:, 0].double() * middle * large * (1 - small / middle.clamp_min(1e-30))
+    facing_y, facing_z = ((area * rows.gather(1, thinnest)[:, 0] ** 2).sum() for rows in (of_y, of_z))
+    spread_y, spread_z = (
+        (means[near, k].quantile(0.9) - means[near, k].quantile(0.1)).clamp_min(1e-6 * radius) for k in (1, 2)
+    )
+    is_picture = facing_z > PICTURE * area.sum()
+    if not is_picture and facing_z * spread_y > Z_IS_UP * facing_y * spread_z:
+        return axes[2], axes[1], DOWN
+    return -axes[1], axes[2], 0.0 if is_picture else DOWN
+
+
+def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch.Tensor, angle: float) -> io.View:
+    """A camera that looks at the centre with most of the scene in the picture: along `ahead`, and down by an angle.
+
+    Args:
+        center, up, ahead: (3,), the last two of length 1 and orthogonal.
+        radius: World units.
+        angle: Radians.
+    """
     width, height = DEFAULT_SIZE
+    forward = math.cos(angle) * ahead - math.sin(angle) * up
+    down = -math.sin(angle) * ahead - math.cos(angle) * up
     w2c = torch.eye(4, dtype=torch.float64, device="cpu")
-    w2c[:3, 3] = -center
-    w2c[2, 3] += 2 * radius * DEFAULT_FOCAL / height + 0.2
+    w2c[:3, :3] = torch.stack([torch.linalg.cross(down, forward), down, forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ center
+    w2c[2, 3] += MARGIN * 2 * radius * DEFAULT_FOCAL / height + 0.2
     return io.View("overview", width, height, DEFAULT_FOCAL, DEFAULT_FOCAL, w2c)
 
 
 def _view_entry(view: io.View) -> dict:
     entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
+    if view.lens is not None:
+        entry["name"] += " (without its lens)"  # the page has pinholes
     entry["cx"] = view.width / 2 if view.cx is None else view.cx
     entry["cy"] = view.height / 2 if view.cy is None else view.cy
     return entry | {"w2c": view.w2c.flatten().tolist()}

@@ -230,6 +230,8 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   Tensor means, log_scales, quats, logit_opacities, shs;
   int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.
   Tensor target, dL_dloss;   ///< As of `l1_ssim`.
+  OptionalTensor exposure;   ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
+  OptionalTensor mask;       ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
   double ssim_weight = 0;
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
@@ -243,6 +245,8 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
     visit("mean_columns", mean_columns);
     visit("target", target);
     visit("dL_dloss", dL_dloss);
+    visit("exposure", exposure);
+    visit("mask", mask);
     visit("ssim_weight", ssim_weight);
     visit("bg", bg);
     visit("viewmatrix", viewmatrix);

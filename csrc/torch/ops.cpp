@@ -9,11 +9,13 @@
 #include <limits>
 #include <new>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
 #include "core/camera.h"
 #include "core/footprint/registry.h"
+#include "core/project.h"
 #include "core/sh.h"
 #include "core/ssim.h"
 #include "cpu/stages.h"
@@ -170,6 +172,14 @@ std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<doub
   return {seen, slopes};
 }
 
+/// Bounds of how far splats reach with a footprint: variance that it adds [px^2], level at opacity 1, and a factor for
+/// rounding. A splat of variance v and opacity a shows within factor * sqrt((v + variance) * (level + max(0, 2 log a)))
+/// of its mean along an axis, or 2 px more.
+std::tuple<double, double, double> reach_bounds(const std::string& footprint, double option) {
+  const CullBounds<double> bounds = cull_bounds<double>(find_footprint(footprint, option).choice);
+  return {bounds.variance, bounds.level, double(kReachMargin)};
+}
+
 /// (name, size) of the members of Lens.
 std::vector<std::pair<std::string, int>> lens_members() {
   std::vector<std::pair<std::string, int>> members;
@@ -271,6 +281,7 @@ PYBIND11_MODULE(_C, m) {
   m.attr("LENS") = ar::ops::lens_members();
   m.def("lens_points", &ar::ops::lens_points,
         "Positions and derivatives of points through a lens (csrc/torch/ops.cpp).");
+  m.def("reach_bounds", &ar::ops::reach_bounds, "Bounds of how far splats reach (csrc/torch/ops.cpp).");
   m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();

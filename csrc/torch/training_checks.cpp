@@ -171,6 +171,15 @@ void check(PictureArguments& a) {
   check_target_type(a.target, like);
   const std::vector<int64_t> image = {3, a.image_height, a.image_width};
   check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
+  if (a.exposure) {
+    like.check_type(*a.exposure, "exposure");
+    check_shape(a.exposure->sizes() == at::IntArrayRef({3, 4}), *a.exposure, "exposure", "(3, 4)");
+  }
+  if (a.mask) {
+    like.check_type(*a.mask, "mask");
+    const std::vector<int64_t> pixels = {a.image_height, a.image_width};
+    check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
+  }
 }
 
 void check(AdamArguments& a) {

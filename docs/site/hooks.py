@@ -1,8 +1,8 @@
 """What the site (mkdocs.yml) does beyond Markdown: links out of docs/, and pages from files at the top of the tree.
 
 A page reads the same on GitHub, where links are relative to the file. Here a link to another page becomes a link to
-that page, a link to a file outside of docs/ becomes one to the repository's address (`extra.repository`), or without
-an address the path as text. A link to a file that does not exist is a warning, which the strict build fails on.
+that page, a link to a file outside of docs/ becomes one to the repository's address (of pyproject.toml), or without an
+address the path as text. A link to a file that does not exist is a warning, which the strict build fails on.
 """
 
 import logging
@@ -29,10 +29,16 @@ def on_files(files, config):
     return files
 
 
+def address_of_files():
+    """Where the repository shows its files, by the variable of pyproject.toml; empty without an address."""
+    address = re.search(r'^repository = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.M)[1]
+    return f"{address.rstrip('/')}/blob/main" if address else ""
+
+
 def on_page_markdown(markdown, page, config, files):
     folder, name = os.path.split(page.file.abs_src_path)
     source = pathlib.Path(os.path.realpath(folder), name)
-    return as_python_markdown(with_links(markdown, source, page.file.src_uri, config.extra["repository"]))
+    return as_python_markdown(with_links(markdown, source, page.file.src_uri, address_of_files()))
 
 
 def with_links(markdown, source, page, repository):

@@ -182,5 +182,45 @@ TYPED_TEST(CameraModelTest, AdjointsOfThePointMatchDifferences) {
   }
 }
 
+// Nearer to a pole than Lens::reach says, and on it.
+TEST(EquirectangularTest, NothingIsLargerAtThePolesThanAtTheReach) {
+  Random random(5);
+  for (const double across : {0.0, 1e-300, 1e-20, 1e-9, 1e-3, 0.5, 0.999}) {
+    for (const double up : {-1.0, 1.0}) {
+      const Trial t(random, kCameraModel<Equirectangular>, kNearAxis);
+      const FullCamera<double>& camera = t.camera;
+      const double angle = random.uniform(-kPi, kPi), n = 3, cap = across / camera.lens.reach;
+      const Vec3<double> p = {n * cap * std::sin(angle), n * up * std::sqrt(1 - cap * cap), n * cap * std::cos(angle)};
+      const ProjectedMean<double> seen = project_mean(camera, t.at.test.world(p.x, p.y, p.z));
+      ASSERT_TRUE(seen.valid);
+      const double largest = camera.lens.reach * std::max(camera.focal.x, camera.focal.y) / n;
+      const Vec2<double> v = Equirectangular::velocity(camera, p, t.w);
+      Vec3<double> by_view = {0, 0, 0};
+      Equirectangular::map_vjp(camera, seen, {1, 0}, by_view);
+      EXPECT_LE(std::sqrt(dot(by_view, by_view)), largest * (1 + 1e-9));
+      EXPECT_LE(std::abs(v.x), largest * std::sqrt(dot(t.w, t.w)) * (1 + 1e-9));
+      const Jacobian<double> j = make_jacobian(camera, p);
+      EXPECT_NEAR(std::sqrt(dot(j.x, j.x)), camera.lens.reach * camera.focal.x / n, 1e-9 * largest);
+      EXPECT_NEAR(std::sqrt(dot(j.y, j.y)), camera.focal.y / n, 1e-9 * largest);
+      const Vec3<double> g = jacobian_vjp(camera, j, p, {j.x, j.y, dot(j.x, j.x) + dot(j.y, j.y)});
+      EXPECT_LE(std::sqrt(dot(g, g)), 4 * largest * largest * camera.lens.reach);
+    }
+  }
+}
+
+// A splat is shown where it is nearest to the middle of the picture, which may lie on the seam.
+TEST(EquirectangularTest, ThePixelIsLessThanHalfATurnFromTheMiddle) {
+  Random random(6);
+  for (int trial = 0; trial < kTrials; ++trial) {
+    Trial t(random, kCameraModel<Equirectangular>, kNearAxis);
+    t.camera.lens.center = {random.uniform(-4, 4), 0};
+    const double longitude = random.uniform(-kPi, kPi), turn = 2 * kPi * t.camera.focal.x;
+    const double x = t.pixel({2 * std::sin(longitude), 0.3, 2 * std::cos(longitude)}).x - 31.5;
+    EXPECT_LE(std::abs(x), turn / 2 * (1 + 1e-12));
+    const double turns = (x - t.camera.focal.x * (longitude - t.camera.lens.center.x)) / turn;
+    EXPECT_NEAR(turns, std::round(turns), 1e-9);
+  }
+}
+
 }  // namespace
 }  // namespace ar::test

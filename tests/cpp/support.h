@@ -168,7 +168,8 @@ template <typename T> View<T> random_view(Random& random, int effects, int model
   } else if (model != kCameraModel<Pinhole> && model != kCameraModel<Orthographic>) {
     for (T& k : view.lens.distortion) k = T(0.02 * random.normal());
   }
-  view.lens.reach = T(random.uniform(0.5, 1));
+  const bool equirectangular = model == kCameraModel<Equirectangular>;
+  view.lens.reach = T(equirectangular ? random.uniform(10, 100) : random.uniform(0.5, 1));
   const auto normal = [&](double size) { return T(size * random.normal()); };
   if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
   if (effects & kDefocus) {

@@ -15,20 +15,24 @@ from ...effects import MAX_SH_DEGREE
 from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, resolve_footprint
 from ...settings import one_number, whole_number
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""What `rasterization` renders: colours, accumulated depth, expected depth, or both kinds."""
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED", "d", "Ed", "RGB-d", "RGB-Ed")
+"""What `rasterization` renders: colours, accumulated or expected depth, distance along the ray, or both kinds."""
 RASTERIZE_MODES = ("classic", "antialiased")
 """Filters of `rasterization`, where no footprint was chosen."""
+CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
+"""Cameras of `rasterization`; the first and the last may have coefficients of a lens."""
 
+_RADIAL = {"pinhole": 6, "fisheye": 4}  # coefficients
+_NOT_CAMERAS = ("ftheta", "lidar")  # of gsplat
 _REFUSED = {
     "sparse_grad": "gradients are dense tensors",
-    "with_ut": "the unscented transform of 3DGUT is not implemented",
     "with_eval3d": "Gaussians are evaluated in the image, not along rays",
-    "radial_coeffs": "lenses without distortion only, undistort the images",
-    "tangential_coeffs": "lenses without distortion only, undistort the images",
-    "thin_prism_coeffs": "lenses without distortion only, undistort the images",
-    "ftheta_coeffs": "lenses without distortion only, undistort the images",
+    "rays": "rays are those of the camera",
+    "ftheta_coeffs": "lenses are those of OpenCV",
+    "lidar_coeffs": "cameras are pinhole, ortho or fisheye",
+    "external_distortion_coeffs": "nothing but the lens bends rays",
     "viewmats_rs": "the shutter is global",
+    "ut_params": "the unscented transform of 3DGUT is not implemented",
 }
 """Arguments of gsplat that are refused, and why."""
 
@@ -42,24 +46,70 @@ class Sizes:
     gaussians: int
 
 
-def refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any) -> None:
-    """Raises NotImplementedError for what gsplat renders and this package does not."""
+@dataclass(frozen=True)
+class Mode:
+    """What a render mode asks for.
+
+    Attributes:
+        colors, depth: Whether there are channels of colours, and one of depth.
+        distance: Whether depth is the distance along the ray.
+        expected: Whether depth is divided by alpha.
+    """
+
+    colors: bool
+    depth: bool
+    distance: bool
+    expected: bool
+
+    @classmethod
+    def of(cls, render_mode: str) -> Mode:
+        """Of one of `RENDER_MODES`."""
+        depth = render_mode.removeprefix("RGB").lstrip("+-")
+        return cls(render_mode.startswith("RGB"), bool(depth), depth.endswith("d"), depth.startswith("E"))
+
+
+def refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any, with_ut: bool, has_lens: bool) -> None:
+    """Raises NotImplementedError for what gsplat renders and this package does not.
+
+    `with_ut` is what gsplat demands for a lens. Here a lens needs no unscented transform, so that it may be asked for.
+    """
     for name, value in asked.items():
         if value is not None and value is not False:
             raise NotImplementedError(f"{name} is not supported: {_REFUSED[name]}")
+    if with_ut and not (has_lens or camera_model == "fisheye"):
+        raise NotImplementedError(
+            "with_ut is not supported: the unscented transform of 3DGUT is not implemented; with a lens it may be "
+            "True, and the lens is exact"
+        )
     if rolling_shutter is not None and getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
         raise NotImplementedError(f"rolling_shutter is not supported: the shutter is global; got {rolling_shutter}")
-    if camera_model in ("fisheye", "ftheta"):
-        raise NotImplementedError(f"camera_model {camera_model!r} is not supported: cameras are pinhole or ortho")
-    check_choice("camera_model", camera_model, ("pinhole", "ortho"))
+    if camera_model in _NOT_CAMERAS:
+        raise NotImplementedError(
+            f"camera_model {camera_model!r} is not supported: cameras are {', '.join(CAMERA_MODELS)}"
+        )
+    check_choice("camera_model", camera_model, CAMERA_MODELS)
 
 
-def check_distributed(sizes: Sizes, per_camera: bool) -> None:
+def check_lens(
+    means: torch.Tensor, sizes: Sizes, camera_model: str, radial: Any, tangential: Any, thin_prism: Any
+) -> None:
+    """Raises for coefficients that are none of the camera's."""
+    given = {"radial_coeffs": radial, "tangential_coeffs": tangential, "thin_prism_coeffs": thin_prism}
+    for (name, tensor), count in zip(given.items(), (_RADIAL.get(camera_model), 2, 4)):
+        if tensor is None:
+            continue
+        if count is None:
+            raise ValueError(f"{name} must be None where camera_model is {camera_model!r}")
+        _check_tensor(name, tensor, means, (*sizes.batch, sizes.cameras, count))
+
+
+def check_distributed(sizes: Sizes, **signals: Signal | None) -> None:
     """Raises ValueError for what ranks cannot share."""
     if sizes.batch:
         raise ValueError(f"means must have no leading dimensions where distributed is True, got {sizes.batch}")
-    if per_camera:
-        raise ValueError("colors must be shared by the cameras where distributed is True, got colors per camera")
+    for name, signal in signals.items():
+        if signal is not None and signal.per_camera:
+            raise ValueError(f"{name} must be shared by the cameras where distributed is True, got {name} per camera")
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
@@ -123,29 +173,85 @@ def check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any
     return sizes
 
 
+@dataclass(frozen=True)
+class Signal:
+    """What Gaussians carry: colours, or extra signals.
+
+    Attributes:
+        values: (..., N, D), or of harmonics (..., N, K, D); with C before N if `per_camera`.
+        degree: Of the harmonics in use; None: there are none.
+        per_camera: Whether every camera has values of its own.
+    """
+
+    values: torch.Tensor
+    degree: int | None
+    per_camera: bool
+
+    @property
+    def channels(self) -> int:
+        """D."""
+        return self.values.shape[-1]
+
+
+def check_signal(
+    name: str, means: torch.Tensor, sizes: Sizes, values: Any, degree: Any, degree_name: str, channels: int | None
+) -> Signal:
+    """The signal, after checking it. Harmonics without leading dimensions serve every batch index, as in gsplat 1.6.
+
+    Args:
+        channels: How many harmonics must have; None: any number.
+    """
+    if not isinstance(values, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(values).__name__}")
+    last = tuple(values.shape[-1:])
+    if degree is not None:
+        last = (*values.shape[-2:-1], *(last if channels is None else (channels,)))
+    of_all = sizes.gaussians, *last
+    shapes = [(*sizes.batch, *of_all), (*sizes.batch, sizes.cameras, *of_all)]
+    if degree is not None and sizes.batch:
+        shapes.append(of_all)
+    _check_tensor(name, values, means, *shapes)
+    if degree is not None:
+        if degree not in range(MAX_SH_DEGREE + 1):
+            raise ValueError(f"{degree_name} must be 0 to {MAX_SH_DEGREE}, got {degree}")
+        if last[0] < (degree + 1) ** 2:
+            raise ValueError(f"{name} must have {(degree + 1) ** 2} harmonics of degree {degree}, got {last[0]}")
+    per_camera = values.shape == shapes[1]
+    return Signal(values if per_camera else values.expand(shapes[0]), degree, per_camera)
+
+
 def check_colors(
     means: torch.Tensor, sizes: Sizes, colors: Any, backgrounds: Any, sh_degree: int | None, render_mode: str
-) -> bool:
-    """Whether every camera has colours of its own, after checking them."""
-    if not isinstance(colors, torch.Tensor):
-        raise TypeError(f"colors must be a tensor, got {type(colors).__name__}")
-    last = tuple(colors.shape[-1:]) if sh_degree is None else (*colors.shape[-2:-1], 3)
-    shared, own = (
-        (*sizes.batch, sizes.gaussians, *last),
-        (*sizes.batch, sizes.cameras, sizes.gaussians, *last),
-    )
-    _check_tensor("colors", colors, means, shared, own)
-    most = MAX_CHANNELS if render_mode == "RGB" else MAX_CHANNELS - 1
-    if sh_degree is None and "RGB" in render_mode and not 1 <= last[0] <= most:
-        raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {last[0]}")
-    if sh_degree is not None:
-        if sh_degree not in range(MAX_SH_DEGREE + 1):
-            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
-        if last[0] < (sh_degree + 1) ** 2:
-            raise ValueError(f"colors must have {(sh_degree + 1) ** 2} harmonics of degree {sh_degree}, got {last[0]}")
+) -> Signal | None:
+    """The colours, after checking them; None where there are none, which depth alone allows."""
+    mode = Mode.of(render_mode)
+    if colors is None and not mode.colors:
+        return None
+    signal = check_signal("colors", means, sizes, colors, sh_degree, "sh_degree", 3)
+    most = MAX_CHANNELS - mode.depth
+    if sh_degree is None and mode.colors and not 1 <= signal.channels <= most:
+        raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {signal.channels}")
     if backgrounds is not None:
-        _check_tensor("backgrounds", backgrounds, means, (*sizes.batch, sizes.cameras, last[-1]))
-    return colors.shape == own
+        _check_tensor("backgrounds", backgrounds, means, (*sizes.batch, sizes.cameras, signal.channels))
+    return signal
+
+
+def check_extra(
+    means: torch.Tensor, sizes: Sizes, extra_signals: Any, degree: int | None, others: int
+) -> Signal | None:
+    """The extra signals, after checking them, beside as many other channels; None where there are none."""
+    if extra_signals is None:
+        if degree is not None:
+            raise ValueError(f"extra_signals_sh_degree must be None without extra_signals, got {degree}")
+        if others > MAX_CHANNELS:
+            raise ValueError(f"channels must be at most {MAX_CHANNELS}, depth and normals included, got {others}")
+        return None
+    name = "extra_signals_sh_degree"
+    signal = check_signal("extra_signals", means, sizes, extra_signals, degree, name, None)
+    if not 1 <= signal.channels <= MAX_CHANNELS - others:
+        most = MAX_CHANNELS - others
+        raise ValueError(f"extra_signals must have 1 to {most} channels beside the others, got {signal.channels}")
+    return signal
 
 
 def settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps2d: float) -> Footprint:

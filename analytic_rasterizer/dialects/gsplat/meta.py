@@ -14,7 +14,10 @@ from ...stages import Splats
 from .arguments import Sizes
 
 _EXTENT = 3.33  # standard deviations in gsplat's radii at most: there an opacity of 1 has fallen to ALPHA_MIN
-_PIXEL_VARIANCE = 1 / 12  # px^2, of a square pixel
+# px^2, of a square pixel. The weight of every footprint but `point` and `mip` is an integral over the pixel, whatever
+# its samples. Around the mean its covariance is that of the Gaussian plus this (tests/test_gsplat.py measures it). Its
+# peak is below 1, which the radii leave out: they are bounds.
+_PIXEL_VARIANCE = 1 / 12
 _LARGEST_RADIUS = 1e9  # px, fits an int32
 
 ROWS = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
@@ -39,12 +42,17 @@ class Measures:
 
 
 @torch.no_grad()
-def measure(splats: Splats, footprint: Footprint, radius_clip: float) -> Measures:
+def measure(
+    splats: Splats, footprint: Footprint, radius_clip: float, depths: tuple[float, float] | None = None
+) -> Measures:
     """Radii by gsplat's definition: half the width and height, in whole px, of the ellipse where alpha is 1/255.
 
     A splat whose rectangle misses the image is not drawn, as in gsplat. This hides nothing: the centre of the nearest
     pixel is half a pixel further away, so that alpha is below 1/255 there also where the weight is an integral over
     the pixel.
+
+    Args:
+        depths: What is not between these is not drawn; None: `project` has looked at it.
     """
     variance = footprint.option if footprint.name in (DILATED, COMPENSATED) else _PIXEL_VARIANCE
     xx, xy, yy = splats.cov2d.unbind(1)
@@ -59,6 +67,8 @@ def measure(splats: Splats, footprint: Footprint, radius_clip: float) -> Measure
     x, y = (splats.means2d + 0.5).unbind(1)
     on_image = (x + rx > 0) & (x - rx < splats.width) & (y + ry > 0) & (y - ry < splats.height)
     drawn = on_image & (rx > 0) & (ry > 0) & ((rx > radius_clip) | (ry > radius_clip))
+    if depths is not None:
+        drawn &= (splats.depths > depths[0]) & (splats.depths < depths[1])
     radii = torch.where(drawn[:, None], torch.stack([rx, ry], 1), 0).int()
     return Measures(drawn, radii, conics, opacities)
 

@@ -11,6 +11,8 @@ from ... import relocation
 from ...rotations import product, rotation_matrices
 from .rendering import rasterization, upper_triangle
 
+_TORCH_FLAG = "_force_torch_backend"  # of gsplat.strategy.ops: whether noise is added without gsplat's CUDA code
+
 
 def rasterization_2dgs(*args: Any, **kwargs: Any) -> None:
     """gsplat's rasterizer of 2D Gaussian splatting, which this package does not have.
@@ -85,10 +87,12 @@ def patch() -> None:
     To be called before other modules import names from gsplat: what they have imported already stays gsplat's. The
     three functions are `rasterization`, `compute_relocation` and `quat_scale_to_covar_preci`, which is what gsplat's
     DefaultStrategy and MCMCStrategy and nerfstudio's splatfacto call. Before version 1.5 `meta["radii"]` had one
-    number per splat: then it is the larger one of the two.
+    number per splat: then it is the larger one of the two. The noise of MCMCStrategy has CUDA code of its own since
+    version 1.6; it is told to take torch.
 
     Raises:
-        ImportError: gsplat is not installed, or is older than its strategies. Tested with 1.4.0 and 1.5.3.
+        ImportError: gsplat is not installed, or is older than its strategies. Tested with 1.4.0 and 1.5.3, and with the
+            signature of 1.6.
     """
     import gsplat
     import gsplat.relocation
@@ -99,6 +103,8 @@ def patch() -> None:
     gsplat.rasterization = gsplat.rendering.rasterization = rasterization if version >= (1, 5) else _with_one_radius
     gsplat.relocation.compute_relocation = gsplat.strategy.ops.compute_relocation = compute_relocation
     gsplat.quat_scale_to_covar_preci = gsplat.strategy.ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
+    if hasattr(gsplat.strategy.ops, _TORCH_FLAG):
+        setattr(gsplat.strategy.ops, _TORCH_FLAG, True)
 
 
 @functools.wraps(rasterization)

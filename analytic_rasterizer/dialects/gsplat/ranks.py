@@ -65,7 +65,8 @@ class Sharing:
             checked = check()
             given = [t for t in tensors.values() if t is not None]
             digest = hashlib.blake2b(repr((settings, str(checked[-1]))).encode(), digest_size=8).digest()
-            cameras = tensors["viewmats"], tensors["Ks"]
+            names = ("viewmats", "Ks", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+            cameras = [tensors[name] for name in names if tensors[name] is not None]
             facts = facts_of(tensors["means"], given, None, "means") | {
                 "cameras": len(tensors["viewmats"]),
                 "settings": int.from_bytes(digest, "little", signed=True),
@@ -78,12 +79,16 @@ class Sharing:
         moving = any(of_rank["moving"] for of_rank in facts)
         return checked, cls(rank, world, facts[0]["cameras"], first_id, join, moving)
 
-    def all_cameras(self, viewmats: torch.Tensor, Ks: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(N C, 4, 4) and (N C, 3, 3) of all N ranks. Differentiable."""
-        own = torch.cat([viewmats.flatten(1), Ks.flatten(1)], 1)
+    def all_cameras(
+        self, viewmats: torch.Tensor, Ks: torch.Tensor, coefficients: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """(N C, 4, 4), (N C, 3, 3) and, where there are lenses, their (N C, 12) of all N ranks. Differentiable."""
+        of_lens = viewmats.new_empty(len(viewmats), 0) if coefficients is None else coefficients
+        own = torch.cat([viewmats.flatten(1), Ks.flatten(1), of_lens], 1)
         join = own.new_zeros((), requires_grad=True) if self.moving else None
-        views, intrinsics = _AllCameras.apply(own, self.world, join).split([16, 9], 1)
-        return views.reshape(-1, 4, 4), intrinsics.reshape(-1, 3, 3)
+        every = _AllCameras.apply(own, self.world, join)
+        views, intrinsics, of_lens = every.split([16, 9, of_lens.shape[1]], 1)
+        return views.reshape(-1, 4, 4), intrinsics.reshape(-1, 3, 3), None if coefficients is None else of_lens
 
     def send(
         self, splats: Splats, features: torch.Tensor, absolute: torch.Tensor | None

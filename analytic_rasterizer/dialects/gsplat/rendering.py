@@ -10,25 +10,28 @@ import torch
 
 from ..._C import TILE
 from ...autocast import widened
-from ...camera import camera_matrices
-from ...effects import Effects
 from ...footprints import Footprint
-from ...settings import GaussianRasterizationSettings
-from ...stages import Splats, blend, list_tiles, project
+from ...stages import Splats, blend, list_tiles
 from .arguments import (
     RASTERIZE_MODES,
     RENDER_MODES,
+    Mode,
+    Signal,
     Sizes,
     check_choice,
     check_colors,
     check_distributed,
+    check_extra,
+    check_lens,
     check_numbers,
     check_scene,
     refuse,
     settle_footprint,
 )
-from .meta import ROWS, KeepAbsolute, Layout, measure, without_culled
+from .cameras import lens_coefficients, settings_of
+from .meta import KeepAbsolute, Layout, measure, without_culled
 from .ranks import Sharing
+from .scene import Scene
 
 _SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
 
@@ -38,7 +41,7 @@ def rasterization(
     quats: torch.Tensor | None,
     scales: torch.Tensor | None,
     opacities: torch.Tensor,
-    colors: torch.Tensor,
+    colors: torch.Tensor | None,
     viewmats: torch.Tensor,
     Ks: torch.Tensor,
     width: int,
@@ -49,7 +52,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = 16,
     backgrounds: torch.Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -69,12 +72,22 @@ def rasterization(
     rolling_shutter: Any = None,
     viewmats_rs: torch.Tensor | None = None,
     *,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: torch.Tensor | None = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    ut_params: Any = None,
+    extra_signals: torch.Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
     footprint: str | Footprint | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Renders N Gaussians into C cameras, for every index of the leading dimensions `...`, of which there may be none.
 
-    Differentiable in all tensors, also in viewmats and Ks. Floating tensors share one device and dtype (float32;
-    float64 on the CPU).
+    The arguments up to viewmats_rs are those of gsplat 1.5.3, in its order. Those behind are what gsplat 1.6 added, and
+    footprint. Differentiable in all tensors, also in viewmats, Ks and coefficients of lenses. Floating tensors share
+    one device and dtype (float32; float64 on the CPU).
 
     Args:
         means: (..., N, 3) centres, world units.
@@ -82,12 +95,14 @@ def rasterization(
         scales: (..., N, 3) standard deviations, world units.
         opacities: (..., N) 0 to 1.
         colors: (..., N, D) or, for every camera, (..., C, N, D): colours or features, at most 512 channels, depth
-            included. With sh_degree: (..., N, K, 3) or (..., C, N, K, 3) spherical harmonics.
+            included. With sh_degree: (..., N, K, 3), (N, K, 3) or (..., C, N, K, 3) spherical harmonics. None: depth
+            alone is rendered.
         viewmats: (..., C, 4, 4) world to camera; x right, y down, z forward.
         Ks: (..., C, 3, 3) focal lengths and principal points, px, the image spanning [0, width] x [0, height]. Of an
             orthographic camera the focal lengths are px per world unit.
         width, height: Size of the images, px.
-        near_plane, far_plane: Camera-space z between which Gaussians are drawn, world units.
+        near_plane, far_plane: Camera-space z between which Gaussians are drawn, world units; of a fisheye with
+            global_z_order=False the distance from the camera.
         radius_clip: A splat whose radii are at most this many px is not drawn.
         eps2d: Variance of the filter, px^2: `point:dilation=eps2d` in the mode "classic", `mip:variance=eps2d` in
             the mode "antialiased". Not read where a footprint was chosen.
@@ -95,18 +110,32 @@ def rasterization(
         packed: Whether `meta` has a row per splat, or a place for every Gaussian in every camera.
         tile_size: Ignored: tiles have the size that suits the footprint.
         backgrounds: (..., C, D) colours behind the Gaussians; None: zero. There is no depth behind them.
-        render_mode: "RGB" for colours, "D" for accumulated depth, "ED" for expected depth, "RGB+D", "RGB+ED".
+        render_mode: "RGB" for colours, "D" for accumulated depth, "ED" for expected depth, "RGB+D", "RGB+ED"; with "d"
+            and "Ed", "RGB-d" and "RGB-Ed" depth is the distance of the Gaussian's centre along its ray.
         absgrad: Let the backward pass set `meta["means2d"].absgrad`: sums over pixels of absolute gradients.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk, segmented: Ignored: all channels are blended in one pass, and sorting has one way.
-        camera_model: "pinhole" or "ortho".
+        camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
         covars: (..., N, 3, 3) covariances in place of quats and scales, world units^2; the upper triangle is read.
         distributed: Whether the ranks of torch.distributed's default group render together: each gives Gaussians and
             cameras of its own, as many cameras as every other, and gets the images of its cameras from the Gaussians of
             all. There are no leading dimensions then, and colors are shared by the cameras. Every rank has to run the
             backward pass. Without a process group, or with one rank, it changes nothing.
-        sparse_grad, with_ut, with_eval3d: Refused unless they ask for nothing.
-        radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs: Likewise.
+        radial_coeffs: (..., C, 6) k1 to k6 of OpenCV's lens, or for a fisheye (..., C, 4) k1 to k4; see `ar.Lens`.
+        tangential_coeffs: (..., C, 2) p1, p2.
+        thin_prism_coeffs: (..., C, 4) s1 to s4.
+        with_ut: With a lens, or a fisheye, it may be True, and changes nothing: means go through the exact map,
+            covariances through its Jacobian. Without one it is refused.
+        sparse_grad, with_eval3d, ftheta_coeffs, rolling_shutter, viewmats_rs: Refused unless they ask for nothing.
+        rays, lidar_coeffs, external_distortion_coeffs, ut_params: Likewise.
+        return_normals: Render the Gaussians' third axes, turned towards the camera, in the axes of the world.
+        global_z_order: Draw, and show as depth, by camera-space z; False: by the distance from the camera. A fisheye
+            sees beyond 90 degrees from its axis with False alone.
+        extra_signals: (..., N, E) or (..., C, N, E), rendered like colours into meta, without a background. With
+            extra_signals_sh_degree: (..., N, K, E), (N, K, E) or (..., C, N, K, E) spherical harmonics, whose sum plus
+            1/2 is rendered, not clamped. They are projected twice more for every three channels.
+        extra_signals_sh_degree: Degree of these harmonics in use, 0 to 4, or None.
+        renderer_config: Ignored: it chooses an implementation.
         footprint: See `resolve_footprint`. None: the one that `set_default_footprint` or the environment variable
             ANALYTIC_RASTERIZER_FOOTPRINT chose, or else the filter of rasterize_mode and eps2d.
 
@@ -120,76 +149,98 @@ def rasterization(
             `point` and `mip`); opacities, in mode "antialiased" with the amplitude of `mip`; the last three without
             gradient, but for opacities in mode "classic", which are those given. batch_ids,
             camera_ids, gaussian_ids: (R,) int64 if packed, else None. width, height, tile_size, tile_width,
-            tile_height, n_batches, n_cameras: numbers. With `distributed` the rows, and C of a table, are those of the
-            rank's own Gaussians in the cameras of all ranks: gaussian_ids count within the rank, camera_ids over all
-            ranks; n_cameras is that of the rank. gsplat's lists of tiles (tiles_per_gauss, isect_ids,
-            flatten_ids, isect_offsets) are missing.
+            tile_height, n_batches, n_cameras: numbers. Where they were asked for, render_extra_signals
+            (..., C, height, width, E) and normals (..., C, height, width, 3). With `distributed` the rows, and C of a
+            table, are those of the rank's own Gaussians in the cameras of all ranks: gaussian_ids count within the
+            rank, camera_ids over all ranks; n_cameras is that of the rank. gsplat's lists of tiles (tiles_per_gauss,
+            isect_ids, flatten_ids, isect_offsets) are missing.
 
     Raises:
         NotImplementedError: What this package does not render; the message names it.
         TypeError: Not a tensor, or a wrong dtype.
-        ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only.
+        ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only, those of lenses
+            everywhere.
         RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
     """
     means, quats, scales, opacities, covars = map(widened, (means, quats, scales, opacities, covars))
-    colors, viewmats, Ks, backgrounds = map(widened, (colors, viewmats, Ks, backgrounds))
+    colors, viewmats, Ks, backgrounds, extra_signals = map(widened, (colors, viewmats, Ks, backgrounds, extra_signals))
+    lens = tuple(map(widened, (radial_coeffs, tangential_coeffs, thin_prism_coeffs)))
     asked = {
         "sparse_grad": sparse_grad,
-        "with_ut": with_ut,
         "with_eval3d": with_eval3d,
-        "radial_coeffs": radial_coeffs,
-        "tangential_coeffs": tangential_coeffs,
-        "thin_prism_coeffs": thin_prism_coeffs,
+        "rays": rays,
         "ftheta_coeffs": ftheta_coeffs,
+        "lidar_coeffs": lidar_coeffs,
+        "external_distortion_coeffs": external_distortion_coeffs,
         "viewmats_rs": viewmats_rs,
+        "ut_params": ut_params,
     }
+    has_lens = any(part is not None for part in lens)
 
-    def check() -> tuple[Sizes, bool, Footprint]:
-        refuse(asked, camera_model, rolling_shutter)
+    def check() -> tuple[Sizes, Signal | None, Signal | None, Footprint]:
+        refuse(asked, camera_model, rolling_shutter, with_ut, has_lens)
         check_choice("render_mode", render_mode, RENDER_MODES)
         check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
         check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
         sizes = check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
-        per_camera = check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
+        check_lens(means, sizes, camera_model, *lens)
+        signal = check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
+        if return_normals and covars is not None:
+            raise ValueError("covars must be None where return_normals is True: normals are axes of quats")
+        mode = Mode.of(render_mode)
+        others = (signal.channels if signal is not None and mode.colors else 0) + mode.depth + 3 * bool(return_normals)
+        extra = check_extra(means, sizes, extra_signals, extra_signals_sh_degree, others)
         if distributed:
-            check_distributed(sizes, per_camera)
-        return sizes, per_camera, settle_footprint(footprint, rasterize_mode, eps2d)
+            check_distributed(sizes, colors=signal, extra_signals=extra)
+        return sizes, signal, extra, settle_footprint(footprint, rasterize_mode, eps2d)
 
     sharing = None
     if distributed:
         tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-        tensors |= {"viewmats": viewmats, "Ks": Ks, "covars": covars}
+        tensors |= {"viewmats": viewmats, "Ks": Ks, "covars": covars, "extra_signals": extra_signals}
+        tensors |= dict(zip(("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"), lens))
         numbers = (width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode, absgrad)
-        with_channels = colors.shape[-1] if isinstance(colors, torch.Tensor) and colors.dim() else None
-        chosen = rasterize_mode, camera_model, with_channels
-        (own_sizes, per_camera, settled), sharing = Sharing.agreed(check, tensors, (*numbers, *chosen))
+        channels = [t.shape[-1] if isinstance(t, torch.Tensor) and t.dim() else None for t in (colors, extra_signals)]
+        chosen = (
+            rasterize_mode,
+            camera_model,
+            *channels,
+            extra_signals_sh_degree,
+            bool(return_normals),
+            global_z_order,
+        )
+        chosen += tuple(part is None for part in lens)
+        (own_sizes, signal, extra, settled), sharing = Sharing.agreed(check, tensors, (*numbers, *chosen))
     else:
-        own_sizes, per_camera, settled = check()
+        own_sizes, signal, extra, settled = check()
     sizes = own_sizes
+    coefficients = lens_coefficients(viewmats, camera_model, *lens)
     if sharing is not None:
-        viewmats, Ks = sharing.all_cameras(viewmats, Ks)
+        viewmats, Ks, coefficients = sharing.all_cameras(viewmats, Ks, coefficients)
         sizes = dataclasses.replace(own_sizes, cameras=len(viewmats))
     width, height = int(width), int(height)
-    settings = _camera_settings(
+    mode, by_z = Mode.of(render_mode), bool(global_z_order)
+    # `project` cuts a fisheye by the distance.
+    planes = (near_plane, far_plane) if camera_model == "fisheye" and by_z else None
+    settings = settings_of(
         viewmats,
         Ks,
         width,
         height,
         near=near_plane,
-        far=far_plane,
-        orthographic=camera_model == "ortho",
-        sh_degree=sh_degree or 0,
+        far=far_plane if planes is None else math.inf,
+        camera_model=camera_model,
+        coefficients=coefficients,
         footprint=settled,
     )
-    with_colors, with_depth = "RGB" in render_mode, render_mode != "RGB"
-    shs = colors if with_colors and sh_degree is not None else None
     if covars is None:
         covariances = {"scales": scales, "rotations": quats}
     else:
         covariances = {"cov3D_precomp": upper_triangle(covars)}
     gaussians = {"means3D": means, "opacities": opacities, **covariances}
-    splats = _project(sizes, settings, gaussians, shs, per_camera)
-    measures = measure(splats, settled, radius_clip)
+    scene = Scene(sizes, gaussians, viewmats, settings, camera_model, by_z)
+    splats = scene.ordered(scene.project(signal if mode.colors and sh_degree is not None else None))
+    measures = measure(splats, settled, radius_clip, planes)
     if packed:
         splats, measures = without_culled(splats, measures)
     else:
@@ -203,19 +254,25 @@ def rasterization(
         absolute = layout.to_rows(absolute)
     splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
 
-    features = splats.means2d.new_empty(len(splats.means2d), 0)
-    if with_colors:
-        features = _colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors
+    features = scene.features(splats, mode, signal, extra, bool(return_normals))
+    channels = {name: rows.shape[1] for name, rows in features.items()}
+    rows = torch.cat(list(features.values()), 1) if len(features) > 1 else next(iter(features.values()))
     blended = splats
     if sharing is not None:
-        blended, absolute = sharing.send(splats, features, absolute)
-        features = blended.colors  # of any number of channels, which `list_tiles` does not take
-        blended = dataclasses.replace(blended, colors=features.new_empty(0, 3))
-    if with_depth:
-        features = torch.cat([features, blended.depths[:, None]], 1)
-    images, alphas = _blend(blended, features, _backgrounds(backgrounds, with_colors, with_depth), absolute)
-    if render_mode.endswith("ED"):
-        images = torch.cat([images[..., :-1], images[..., -1:] / alphas.clamp(min=_SMALLEST_ALPHA)], -1)
+        blended, absolute = sharing.send(splats, rows, absolute)
+        rows = blended.colors  # of any number of channels, which `list_tiles` does not take
+        blended = dataclasses.replace(blended, colors=rows.new_empty(0, 3))
+    background = None
+    if backgrounds is not None and mode.colors:  # there is none behind the other channels
+        background = torch.nn.functional.pad(backgrounds.flatten(0, -2), (0, rows.shape[1] - channels["colors"]))
+    images, alphas = _blend(blended, rows, background, absolute)
+    dims = (*sizes.batch, own_sizes.cameras)
+    images, alphas = images.unflatten(0, dims), alphas.unflatten(0, dims)
+    made = dict(zip(channels, images.split(list(channels.values()), -1)))
+    if mode.expected:
+        made["depth"] = made["depth"] / alphas.clamp(min=_SMALLEST_ALPHA)
+    if mode.expected or not made.keys() <= {"colors", "depth"}:
+        images = torch.cat([made[name] for name in ("colors", "depth") if name in made], -1)
 
     meta = {
         "batch_ids": splats.camera_ids.long() // sizes.cameras if packed else None,
@@ -234,127 +291,15 @@ def rasterization(
         "n_batches": math.prod(sizes.batch),
         "n_cameras": own_sizes.cameras,
     }
-    dims = (*sizes.batch, own_sizes.cameras)
-    return images.unflatten(0, dims), alphas.unflatten(0, dims), meta
-
-
-# --- projection --------------------------------------------------------------------------------------
-
-
-def _camera_settings(
-    viewmats: torch.Tensor,
-    Ks: torch.Tensor,
-    width: int,
-    height: int,
-    *,
-    near: float,
-    far: float,
-    orthographic: bool,
-    sh_degree: int,
-    footprint: Footprint,
-) -> list[GaussianRasterizationSettings]:
-    """Settings of all cameras, in the order of their leading dimensions, for `project`."""
-    effects = Effects(
-        camera_gradients=True,  # keeps the focal lengths on the device
-        off_center=True,  # the clamp of x/z and y/z is around the centre of the picture, as in gsplat
-        near=near,
-        far=far,
-        orthographic=orthographic,
-    )
-    background = viewmats.new_zeros(3)  # which `project` does not read
-    views, intrinsics = viewmats.reshape(-1, 4, 4).double(), Ks.reshape(-1, 3, 3).double()
-    # gsplat reads no more of a view than its first three rows. The last one is w of an orthographic camera.
-    last = torch.eye(4, dtype=views.dtype, device=views.device)[3].expand(len(views), 1, 4)
-    views = torch.cat([views[:, :3], last], 1)
-    fx, fy, cx, cy = (intrinsics[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    scale = torch.stack([2 * fx / width, 2 * fy / height], 1)
-    center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1], 1)
-    projections, positions = camera_matrices(views, scale, center, orthographic)
-    projections, positions, tangents = (t.to(viewmats.dtype) for t in (projections.mT, positions, 1 / scale))
-    return [
-        GaussianRasterizationSettings(
-            image_height=height,
-            image_width=width,
-            tanfovx=tangent[0],
-            tanfovy=tangent[1],
-            bg=background,
-            scale_modifier=1.0,
-            viewmatrix=view.mT,
-            projmatrix=projection,
-            sh_degree=sh_degree,
-            campos=position,
-            prefiltered=False,
-            debug=False,
-            effects=effects,
-            footprint=str(footprint),
-        )
-        for view, projection, position, tangent in zip(viewmats.reshape(-1, 4, 4), projections, positions, tangents)
-    ]
-
-
-def _project(
-    sizes: Sizes,
-    settings: list[GaussianRasterizationSettings],
-    gaussians: dict[str, torch.Tensor],
-    shs: torch.Tensor | None,
-    per_camera: bool,
-) -> Splats:
-    """Splats of all Gaussians in all cameras; the cameras of batch b are b * C to b * C + C - 1.
-
-    One `project` serves the cameras that see the same Gaussians: those of a batch, unless harmonics are per camera.
-    """
-    batches, dims = math.prod(sizes.batch), len(sizes.batch)
-    flat = {name: value.reshape(batches, *value.shape[dims:]) for name, value in gaussians.items()}
-    if shs is not None:
-        shs = shs.reshape(len(settings) if per_camera else batches, *shs.shape[-3:])
-    together = 1 if shs is not None and per_camera else sizes.cameras
-    parts = []
-    for first in range(0, len(settings), together):
-        batch = first // sizes.cameras
-        of_batch = {name: value[batch] for name, value in flat.items()}
-        if shs is not None:
-            of_batch["shs"] = shs[first if per_camera else batch]
-        parts.append(project(settings[first : first + together], **of_batch))
-    return _join(parts)
+    for key, name in (("render_extra_signals", "extra"), ("normals", "normals")):
+        if name in made:
+            meta[key] = made[name].contiguous()
+    return images, alphas, meta
 
 
 def upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
     """(..., 6) of (..., 3, 3)."""
     return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
-
-
-def _join(parts: list[Splats]) -> Splats:
-    """Splats of several projections as of one, camera after camera."""
-    if len(parts) == 1:
-        return parts[0]
-    cameras = [0]
-    splits = [parts[0].row_splits[:1]]
-    for part in parts:
-        cameras.append(cameras[-1] + part.cameras)
-        splits.append(splits[-1][-1] + part.row_splits[1:])
-    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in ROWS}
-    rows["camera_ids"] = torch.cat([part.camera_ids + first for part, first in zip(parts, cameras)])
-    return dataclasses.replace(parts[0], row_splits=torch.cat(splits), **rows)
-
-
-# --- blending ----------------------------------------------------------------------------------------
-
-
-def _colors_of_rows(splats: Splats, sizes: Sizes, colors: torch.Tensor, per_camera: bool) -> torch.Tensor:
-    """(R, D) of colours that are given per Gaussian, or per camera and Gaussian."""
-    table = splats.camera_ids.long()
-    if not per_camera:
-        table = table // sizes.cameras
-    rows = table * sizes.gaussians + splats.gaussian_ids.long()
-    return colors.flatten(0, -2).index_select(0, rows)
-
-
-def _backgrounds(backgrounds: torch.Tensor | None, with_colors: bool, with_depth: bool) -> torch.Tensor | None:
-    """(B * C, K) of all channels: there is no depth behind the Gaussians."""
-    if backgrounds is None or not with_colors:
-        return None
-    flat = backgrounds.flatten(0, -2)
-    return torch.nn.functional.pad(flat, (0, 1)) if with_depth else flat
 
 
 def _blend(

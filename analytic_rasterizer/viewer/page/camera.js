@@ -1,6 +1,8 @@
 // The camera: a pose, the point that it turns about, and a lens. Axes are OpenCV's: x right, y down, z forward.
 // Vectors are arrays of three numbers, quaternions are (w, x, y, z).
 
+import { CONSTANTS } from './constants.js';
+
 export const add = (a, b) => a.map((value, i) => value + b[i]);
 export const times = (a, factor) => a.map(value => value * factor);
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -10,6 +12,9 @@ export const cross = (a, b) => [
 export const unit = a => times(a, 1 / Math.hypot(...a));
 const minus = (a, b) => a.map((value, i) => value - b[i]);
 
+// Turning about a point and moving to it end before it is behind the near plane, and before the scene is this many
+// times its radius away.
+const NEAREST = 1.5 * CONSTANTS.kNear, FARTHEST = 30;
 // The angle between looking direction and up stays this far from 0 and pi when turning about a point.
 const STEEPEST = 0.05;
 
@@ -144,7 +149,10 @@ export class Camera {
   /// Moves towards the target so that its distance is multiplied by a factor.
   dolly(factor) {
     const { target } = this;
-    this.distance = Math.min(Math.max(this.distance * factor, 1e-4 * this.meta.radius), 1e4 * this.meta.radius);
+    // A pose from elsewhere may be beyond the limits, and stays where it is until it is moved to within.
+    const { distance } = this, least = Math.min(NEAREST, distance);
+    const most = Math.max(FARTHEST * this.meta.radius, NEAREST, distance);
+    this.distance = Math.min(Math.max(distance * factor, least), most);
     this.position = add(target, times(this.axes[2], -this.distance));
   }
 

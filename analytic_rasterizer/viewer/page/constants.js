@@ -1,13 +1,18 @@
-// Numbers of the rasterizer, by their names in csrc/core. tests/test_viewer_page.py compares them with the headers.
+// Numbers of the rasterizer, by their names in csrc/core. tests/test_viewer.py compares them with the headers.
 
 export const CONSTANTS = {
   kNear: 0.2,
   kFrustumClamp: 1.3,
   kAlphaMin: 1 / 255,
+  kLogAlphaMin: -7.99445,
   kAlphaMax: 0.99,
+  kTransmittanceMin: 1e-4,
   kPixelVariance: 1 / 12,
   kLevelSlack: 0.01,
   kMaxDet: 1e30,
+  kMaxScale: 1e18,
+  kMaxOpacity: 1e6,
+  kMaxWhitening: 1e7,
   kBase2: 0.8493218002880191,
   kLog2e: 1.4426950408889634,
   kPi: 3.141592653589793,
@@ -32,11 +37,17 @@ export const HALF_NODES = {
   ],
 };
 
-/// The nodes of a pixel [px].
+/// The nodes of a pixel with fixed samples [px].
 export function nodesOf(samples) {
   if (samples === 1) return [[0, 0]];
   const half = HALF_NODES[samples];
   return [...half, ...half.map(([x, y]) => [-x, -y])];
+}
+
+/// Centres of the equal square cells of a pixel [px]: node() of csrc/core/footprint/moment.h.
+export function cellsOf(samples) {
+  const side = Math.sqrt(samples), centre = k => (2 * k + 1 - side) / (2 * side);
+  return Array.from({ length: samples }, (_, s) => [centre(s % side), centre(Math.floor(s / side))]);
 }
 
 /// A footprint by its name, 'FAMILY' or 'FAMILY:OPTION=VALUE', as an entry of `known`: `footprints` of the scene

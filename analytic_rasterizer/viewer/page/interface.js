@@ -12,6 +12,10 @@ const RADIANS_PER_PX = 0.006;
 const SMALL_TOUCH_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px)';
 export const READING_TIME = 4;  // seconds that a message stays
 
+/// Colours of fields, '#rrggbb', and back.
+export const hexOf = rgb => `#${rgb.map(value => Math.round(255 * value).toString(16).padStart(2, '0')).join('')}`;
+export const rgbOf = hex => [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16) / 255);
+
 /// Shows one sentence in place of the picture.
 export function showFailure(sentence) {
   const paragraph = document.createElement('p');
@@ -39,8 +43,9 @@ export class Interface {
     this.viewer = viewer;
     this.keys = new Set();
     this.pointers = new Map();
-    this.canvas = element('canvas');
-    this.fillIn(viewer.scene.meta);
+    this.surface = element('surface');
+    this.fillIn(viewer.meta);
+    this.showRenderer();
     this.connectControls();
     this.connectPointers();
     this.connectKeys();
@@ -54,13 +59,26 @@ export class Interface {
     document.title = `${meta.name} - Gaussian splats, integrated over the pixel`;
     const count = meta.count.toLocaleString('en');
     element('scene-facts').textContent = `${count} Gaussians, spherical harmonics of degree ${meta.sh_degree}`;
-    const known = meta.footprints.some(({ name }) => name === meta.footprint);
-    const all = known ? meta.footprints : [{ name: meta.footprint, text: meta.footprint }, ...meta.footprints];
-    const options = () => all.map(({ name, text }) => new Option(text, name));
-    element('footprint').replaceChildren(...options());
-    element('compare').replaceChildren(new Option('nothing', ''), ...options());
     element('view').replaceChildren(...meta.views.map((view, k) => new Option(view.name, k)));
     for (const id of ['previous', 'next']) element(id).disabled = meta.views.length < 2;
+  }
+
+  /// Says which renderer draws and why, and offers what it can draw.
+  showRenderer() {
+    const { meta, renderer, reason } = this.viewer;
+    const known = meta.footprints.some(({ name }) => name === meta.footprint);
+    const all = known ? meta.footprints : [this.viewer.footprint(meta.footprint), ...meta.footprints];
+    const options = () => all.map(footprint => {
+      const option = new Option(footprint.text, footprint.name);
+      option.disabled = !renderer.draws(footprint);
+      return option;
+    });
+    element('footprint').replaceChildren(...options());
+    element('compare').replaceChildren(new Option('nothing', ''), ...options());
+    const lacks = all.some(footprint => !renderer.draws(footprint));
+    element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
+      `${lacks ? ' Footprints in grey need WebGPU.' : ''}` +
+      `${renderer.bits === 8 ? ' It has 8 bits per channel: colours are off by up to 6 of 255 levels.' : ''}`;
   }
 
   connectControls() {
@@ -72,6 +90,7 @@ export class Interface {
       input.addEventListener('change', () => viewer.change({ mode: input.value }));
     }
     element('resolution').addEventListener('input', event => viewer.change({ divisor: DIVISORS[event.target.value] }));
+    element('background').addEventListener('input', event => viewer.change({ background: rgbOf(event.target.value) }));
     element('view').addEventListener('change', event => viewer.goToView(Number(event.target.value)));
     element('previous').addEventListener('click', () => viewer.stepView(-1));
     element('next').addEventListener('click', () => viewer.stepView(1));
@@ -83,20 +102,20 @@ export class Interface {
   }
 
   connectPointers() {
-    const { canvas, viewer, pointers } = this;
+    const { surface, viewer, pointers } = this;
     const place = event => ({ x: event.clientX, y: event.clientY });
-    canvas.addEventListener('pointerdown', event => {
-      canvas.setPointerCapture(event.pointerId);
+    surface.addEventListener('pointerdown', event => {
+      surface.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, place(event));
-      canvas.classList.add('dragged');
+      surface.classList.add('dragged');
     });
     const release = event => {
       pointers.delete(event.pointerId);
-      if (pointers.size === 0) canvas.classList.remove('dragged');
+      if (pointers.size === 0) surface.classList.remove('dragged');
     };
-    canvas.addEventListener('pointerup', release);
-    canvas.addEventListener('pointercancel', release);
-    canvas.addEventListener('pointermove', event => {
+    surface.addEventListener('pointerup', release);
+    surface.addEventListener('pointercancel', release);
+    surface.addEventListener('pointermove', event => {
       const old = pointers.get(event.pointerId);
       if (!old) return;
       const now = place(event), others = [...pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
@@ -113,9 +132,9 @@ export class Interface {
         viewer.orbit(x * RADIANS_PER_PX, y * RADIANS_PER_PX);
       }
     });
-    canvas.addEventListener('contextmenu', event => event.preventDefault());
-    canvas.addEventListener('dblclick', event => viewer.focusOn(event.offsetX, event.offsetY));
-    canvas.addEventListener('wheel', event => {
+    surface.addEventListener('contextmenu', event => event.preventDefault());
+    surface.addEventListener('dblclick', event => viewer.focusOn(event.offsetX, event.offsetY));
+    surface.addEventListener('wheel', event => {
       event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 18 : 1);
       viewer.dolly(Math.exp(Math.min(Math.max(pixels * WHEEL_STEP, -1), 1)));
@@ -151,9 +170,10 @@ export class Interface {
       else viewer.orbit(-x, -y);
       return true;
     }
-    const { footprints, compared } = viewer.scene.meta;
-    if (/^[1-9]$/.test(key) && key <= footprints.length) {
-      viewer.change({ footprint: footprints[key - 1].name });
+    const { footprints, compared } = viewer.meta;
+    if (/^[0-9]$/.test(key)) {
+      const chosen = footprints[(Number(key) + 9) % 10];  // 0 is the tenth
+      if (chosen && viewer.renderer.draws(chosen)) viewer.change({ footprint: chosen.name });
       return true;
     }
     const actions = {
@@ -165,7 +185,8 @@ export class Interface {
       c: () => {
         const now = state.compare === null ? 'off' : state.mode;
         const next = COMPARISONS[(COMPARISONS.indexOf(now) + 1) % COMPARISONS.length];
-        const other = compared.find(name => name !== state.footprint);
+        const other = compared.find(
+          name => name !== state.footprint && viewer.renderer.draws(viewer.footprint(name)));
         viewer.change(next === 'off' ? { compare: null } : { compare: state.compare ?? other, mode: next });
       },
       z: () => viewer.change({ divisor: DIVISORS[(DIVISORS.indexOf(state.divisor) + 1) % DIVISORS.length] }),
@@ -192,7 +213,7 @@ export class Interface {
     const moveTo = part => viewer.change({ divider: Math.min(Math.max(part, 0), 1) });
     divider.addEventListener('pointerdown', event => divider.setPointerCapture(event.pointerId));
     divider.addEventListener('pointermove', event => {
-      if (divider.hasPointerCapture(event.pointerId)) moveTo(event.clientX / this.canvas.clientWidth);
+      if (divider.hasPointerCapture(event.pointerId)) moveTo(event.clientX / this.surface.clientWidth);
     });
     divider.addEventListener('keydown', event => {
       const step = event.shiftKey ? 0.1 : 0.02, { divider: now } = viewer.state;
@@ -230,6 +251,7 @@ export class Interface {
     const resolution = divisor === 1 ? '1' : `1/${divisor}`;
     element('resolution-text').textContent = resolution;
     element('resolution').setAttribute('aria-valuetext', resolution);
+    element('background').value = hexOf(this.viewer.state.background);
     element('view').value = this.viewer.camera.view;
     const place = `${100 * divider}%`;
     for (const id of ['divider', 'label-left', 'label-right']) {
@@ -237,8 +259,16 @@ export class Interface {
       element(id).style.left = place;
     }
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
-    element('label-left').textContent = footprint;
-    element('label-right').textContent = compare ?? '';
+    element('label-left').textContent = this.inWords(footprint);
+    element('label-right').textContent = comparing ? this.inWords(compare) : '';
+    const given = [footprint, ...(comparing ? [compare] : [])].filter(name => this.inWords(name) !== name);
+    this.showNote(given.map(name => this.inWords(name)).join('; '));
+  }
+
+  /// A footprint, and what is drawn for it where that is another one.
+  inWords(name) {
+    const drawn = this.viewer.drawn(name).name, wanted = this.viewer.footprint(name).name;
+    return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
   /// Shows how fast frames are, and how large. `rate` is null where the camera rests.

@@ -5,16 +5,19 @@ const embedded = name => document.getElementById(`data-${name}`);
 /// Whether page and scene are one file.
 export const isExported = () => embedded('scene') !== null;
 
+/// What there is to know of the scene before it is loaded: `meta` of viewer/packing.py.
+export async function loadMeta() {
+  return isExported() ? JSON.parse(embedded('scene').textContent) : (await get('scene.json')).json();
+}
+
 /// {meta, geometry, harmonics}; `progress` is called with the part that has been read, from 0 to 1.
-export async function loadScene(progress) {
+export async function loadScene(meta, progress) {
   if (isExported()) {
-    const meta = JSON.parse(embedded('scene').textContent);
     const geometry = await unpack('geometry');
     progress(0.5);
     const harmonics = await unpack('harmonics');
     return { meta, geometry: new Float32Array(geometry), harmonics: new Uint16Array(harmonics) };
   }
-  const meta = await (await get('scene.json')).json();
   const responses = await Promise.all([get('geometry.bin'), get('harmonics.bin')]);
   const sizes = responses.map(response => Number(response.headers.get('Content-Length')));
   const done = [0, 0], total = sizes[0] + sizes[1];

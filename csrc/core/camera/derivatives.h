@@ -65,6 +65,18 @@ template <class S> AR_HD Dual<S> root(const Dual<S>& v) {
   return {r, (S(0.5) / r) * v.gradient};
 }
 
+/// The angle of (x, y) from the axis of x.
+AR_HD float arc_tangent(float y, float x) { return std::atan2(y, x); }
+AR_HD double arc_tangent(double y, double x) { return std::atan2(y, x); }
+template <typename T> AR_HD Line<T> arc_tangent(Line<T> y, Line<T> x) {
+  return Line<T>(arc_tangent(y.value, x.value),
+                 quotient(x.value * y.slope - y.value * x.slope, x.value * x.value + y.value * y.value));
+}
+template <class S> AR_HD Dual<S> arc_tangent(const Dual<S>& y, const Dual<S>& x) {
+  const S inverse = S(1) / (x.value * x.value + y.value * y.value);
+  return {arc_tangent(y.value, x.value), inverse * (x.value * y.gradient - y.value * x.gradient)};
+}
+
 /// Angle over sine, by h = 1 - cosine, 0 <= h < 2: sum of n!/(2n + 1)!! h^n, which has no singularity at 0. k = 2 - h
 /// is a parameter too, for angles near pi, where the difference would lose digits.
 inline constexpr double kArcSeriesEnd = 0.1;

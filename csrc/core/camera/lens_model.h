@@ -8,6 +8,11 @@
 //   turned_back(lens, p)                 p, or if beyond lens.reach a point there
 //   turned_back_vjp(lens, p, g)          its adjoint
 //   inside(camera, p)                    whether the model sees p
+//
+// and may define, because the map has no derivative somewhere, or no coefficients:
+//
+//   regular(lens, p), regular_vjp        p, or for derivatives of the map another point
+//   kDistorts
 #pragma once
 
 #include "core/camera/contract.h"
@@ -16,6 +21,10 @@
 namespace ar {
 
 template <class Model> struct LensModel : CameraModelDefaults {
+  static constexpr bool kDistorts = true;
+  template <typename T> AR_HD static Vec3<T> regular(const Lens<T>&, Vec3<T> p) { return p; }
+  template <typename T> AR_HD static Vec3<T> regular_vjp(const Lens<T>&, Vec3<T>, Vec3<T> g) { return g; }
+
   template <typename T> AR_HD static bool map(const FullCamera<T>& camera, Vec3<T>, ProjectedMean<T>& p) {
     p.ndc = {T(0), T(0)};
     p.clip_w = T(1);
@@ -29,7 +38,7 @@ template <class Model> struct LensModel : CameraModelDefaults {
   template <typename T>
   AR_HD static Vec3<T> map_vjp(const FullCamera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel,
                                Vec3<T>& dL_dview) {
-    const Rows<T> j = derivative(camera, p.view);
+    const Rows<T> j = derivative(camera, Model::regular(camera.lens, p.view));
     dL_dview += dL_dpixel.x * j.x + dL_dpixel.y * j.y;
     return {T(0), T(0), T(0)};
   }
@@ -76,17 +85,18 @@ template <class Model> struct LensModel : CameraModelDefaults {
   }
 
   template <typename T> AR_HD static Vec2<T> velocity(const FullCamera<T>& camera, Vec3<T> p, Vec3<T> w) {
-    const Rows<T> j = derivative(camera, p);
+    const Rows<T> j = derivative(camera, Model::regular(camera.lens, p));
     return {dot(j.x, w), dot(j.y, w)};
   }
   template <typename T>
   AR_HD static VelocityGrad<T> velocity_vjp(const FullCamera<T>& camera, Vec3<T> p, Vec3<T> w, Vec2<T> g,
                                             Lens<T>& dL_dlens, Vec2<T>& dL_dfocal) {
-    const Rows<T> j = derivative(camera, p), by_j = {g.x * w, g.y * w};
+    const Vec3<T> q = Model::regular(camera.lens, p);
+    const Rows<T> j = derivative(camera, q), by_j = {g.x * w, g.y * w};
     dL_dfocal.x += g.x * dot(j.x, w) / camera.focal.x;
     dL_dfocal.y += g.y * dot(j.y, w) / camera.focal.y;
-    add_slope_vjp(camera, p, by_j, dL_dlens);
-    return {slope_vjp(camera, p, by_j), g.x * j.x + g.y * j.y};
+    add_slope_vjp(camera, q, by_j, dL_dlens);
+    return {Model::regular_vjp(camera.lens, p, slope_vjp(camera, q, by_j)), g.x * j.x + g.y * j.y};
   }
 
  private:
@@ -141,7 +151,11 @@ template <class Model> struct LensModel : CameraModelDefaults {
   }
   /// Adds the gradient of g . image_point + G . its derivative by p.
   template <typename T>
-  AR_HD_CALL static void add_by_distortion(Vec3<T> p, Vec2<T> g, Rows<T> G, const T* distortion, T* to) {
+  AR_HD static void add_by_distortion(Vec3<T> p, Vec2<T> g, Rows<T> G, const T* distortion, T* to) {
+    if constexpr (Model::kDistorts) add_by_coefficients(p, g, G, distortion, to);
+  }
+  template <typename T>
+  AR_HD_CALL static void add_by_coefficients(Vec3<T> p, Vec2<T> g, Rows<T> G, const T* distortion, T* to) {
     Line<T> k[kDistortion];
     for (int i = 0; i < kDistortion; ++i) k[i] = Line<T>(distortion[i]);
     AR_NO_UNROLL
@@ -176,17 +190,9 @@ template <class Model> struct PerspectiveLens : LensModel<Model> {
   }
 };
 
-/// For models that see up to all directions: `reach` and `fold` are angles from the axis. The depth is the distance.
-template <class Model> struct WideLens : LensModel<Model> {
-  template <typename T> AR_HD static bool inside(const FullCamera<T>& camera, Vec3<T> p) {
-    return in_range(camera, length(p)) && !(angle(p) > camera.lens.fold);
-  }
-  template <typename T> AR_HD static Vec3<T> turned_back(const Lens<T>& lens, Vec3<T> p) {
-    return turned_to(p, lens.reach);
-  }
-  template <typename T> AR_HD static Vec3<T> turned_back_vjp(const Lens<T>& lens, Vec3<T> p, Vec3<T> g) {
-    return turned_to_vjp(p, lens.reach, g);
-  }
+/// For models that see more than a half space: the depth is the distance.
+template <class Model> struct DistanceLens : LensModel<Model> {
+  template <typename T> AR_HD static T length(Vec3<T> p) { return sqrt(dot(p, p)); }
 
   template <typename T> AR_HD static T depth(Vec3<T> view) { return length(view); }
   template <typename T> AR_HD static Vec3<T> depth_vjp(Vec3<T> view, T dL_ddepth) {
@@ -202,6 +208,21 @@ template <class Model> struct WideLens : LensModel<Model> {
     dL_dlens.focus -= dL_ddefocus / (lens.focus * lens.focus);
     dL_dp += (dL_ddefocus / (n * n * n)) * p;
   }
+};
+
+/// `reach` and `fold` are angles from the axis.
+template <class Model> struct WideLens : DistanceLens<Model> {
+  using DistanceLens<Model>::length;
+
+  template <typename T> AR_HD static bool inside(const FullCamera<T>& camera, Vec3<T> p) {
+    return in_range(camera, length(p)) && !(angle(p) > camera.lens.fold);
+  }
+  template <typename T> AR_HD static Vec3<T> turned_back(const Lens<T>& lens, Vec3<T> p) {
+    return turned_to(p, lens.reach);
+  }
+  template <typename T> AR_HD static Vec3<T> turned_back_vjp(const Lens<T>& lens, Vec3<T> p, Vec3<T> g) {
+    return turned_to_vjp(p, lens.reach, g);
+  }
 
  private:
   template <typename T> AR_HD_CALL static Vec3<T> turned_to(Vec3<T> p, T reach) {
@@ -216,7 +237,6 @@ template <class Model> struct WideLens : LensModel<Model> {
     const T across = n * s / rho;
     return {out * p.x + across * (g.x - along * ex), out * p.y + across * (g.y - along * ey), out * p.z};
   }
-  template <typename T> AR_HD static T length(Vec3<T> p) { return sqrt(dot(p, p)); }
   template <typename T> AR_HD_CALL static T angle(Vec3<T> p) { return std::atan2(sqrt(p.x * p.x + p.y * p.y), p.z); }
 };
 

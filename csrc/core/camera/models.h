@@ -4,6 +4,7 @@
 
 #include <type_traits>
 
+#include "core/camera/equirectangular.h"
 #include "core/camera/fisheye.h"
 #include "core/camera/fov.h"
 #include "core/camera/orthographic.h"
@@ -15,7 +16,7 @@ namespace ar {
 template <class... M> struct CameraModelList {};
 
 /// Lens::model is an index in this list.
-using CameraModels = CameraModelList<Pinhole, Orthographic, Perspective, Fisheye, RadTanFisheye, Fov>;
+using CameraModels = CameraModelList<Pinhole, Orthographic, Perspective, Fisheye, RadTanFisheye, Fov, Equirectangular>;
 
 template <class... M> constexpr int count_of_models(CameraModelList<M...>) { return sizeof...(M); }
 inline constexpr int kCameraModels = count_of_models(CameraModels());

@@ -13,8 +13,8 @@
 //   kReference    true: for comparisons; the CPU compiles it for one instruction set
 //   kGeneric      true: CUDA has only the slower kernels, for any number of channels
 //   kExpensive    true: CUDA finds out exactly which boxes of pixels a splat reaches
-//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js, with the variance of
-//                 support_variance(); null: the page cannot draw F
+//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/footprint.wgsl.js, with the variance
+//                 of support_variance(); null: the page cannot draw F
 //   Pixels        a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled once for
 //                 all footprints that name this type; void: for F
 //   kSamples      samples of a pixel, each with its own transmittance

@@ -13,11 +13,11 @@ template <int S> struct MomentKey {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
 };
 
-/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian at its centre. `Pixels` and `kPage` are reset,
-/// because nodes of the base class do not move.
+/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian at its centre. `Pixels` is reset, because nodes of
+/// the base class do not move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
-  static constexpr const char* kPage = nullptr;
+  static constexpr const char* kPage = "moving";
   using Gaussian = GaussianFootprint<1, true>;
   static_assert(S == 1 || S == 4 || S == 16, "moment has 1, 4 or 16 samples");
 

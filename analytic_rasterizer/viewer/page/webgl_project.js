@@ -1,8 +1,8 @@
 // The scene on the graphics device, and its projection: one fragment per Gaussian writes a splat.
 
 import { CONSTANTS } from './constants.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './gl.js';
-import { FULL_SCREEN, SPLATS_PER_ROW, projectShader, texelsOfHarmonics } from './shaders.js';
+import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
+import { FULL_SCREEN, SPLATS_PER_ROW, projectShader, texelsOfHarmonics } from './webgl_shaders.js';
 
 /// Gaussians that fit into the largest textures of a device, for harmonics of this degree. Sizes are 4096 or more.
 export function largestCount(maxTextureSize, degree) {

@@ -1,12 +1,11 @@
-// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form; only the
-// window of `analytic` is drawn by polynomials that are fitted to its formula (logistic.js).
+// GLSL of the passes: project, draw, present. The formulas are those of csrc/core, in the same form.
 //
 // Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
 // wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
 // GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
 
-import { CONSTANTS, MINIMAX, nodesOf } from './constants.js';
-import { FLAT_FROM, LAST_HALF, ROWS_PER_UNIT } from './logistic.js';
+import { CONSTANTS, MINIMAX } from './constants.js';
+import { addHarmonics, harmonicNumbers } from './sh.js';
 
 // Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
 export const SPLATS_PER_INSTANCE = 4096;
@@ -25,74 +24,39 @@ precision highp usampler2D;
 ${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glslNumber(value)};`).join('\n')}
 `;
 
-// What `analytic` computes once per splat: F(0) of docs/internals/numerics.md, "Logistic window". `r` = 1/sigma [1/px].
-const WINDOW_TOP = `
+// F(t) of docs/internals/numerics.md, "Logistic window", as numerator and denominator. `r` = 1/sigma [1/px].
+const GL_WINDOW = `
+float logistic2(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }
 float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
   float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
   return x < 0.5 ? x * series : 1.0 - e;
 }
-float windowTop(float r) {
-  float h = 0.5 * r, f = h * (kLogistic1 + kLogistic3 * h * h), e = exp2(-f * kLog2e);
-  return oneMinusExp(f, e) / (1.0 + e);
-}
-`;
-
-// The rest of F by the polynomial of logistic.js: coefficients for each vertex, V for each pixel. `axis` is a row of
-// the whitening matrix [1/px], which is turned into units of w.
-const WINDOW_COEFFICIENTS = `
-uniform sampler2D uWindow;
-void readWindow(inout vec2 axis, out float flatTop, out vec4 c) {
-  float h = 0.5 * length(axis), place = min(h, ${glslNumber(LAST_HALF)}) * ${glslNumber(ROWS_PER_UNIT)};
-  int k = min(int(place), ${LAST_HALF * ROWS_PER_UNIT - 1});
-  float part = place - float(k);
-  vec4 first = mix(texelFetch(uWindow, ivec2(0, k), 0), texelFetch(uWindow, ivec2(0, k + 1), 0), part);
-  float last = mix(texelFetch(uWindow, ivec2(1, k), 0).x, texelFetch(uWindow, ivec2(1, k + 1), 0).x, part);
-  axis *= first.x;
-  flatTop = first.x * max(h - ${glslNumber(FLAT_FROM)}, 0.0);
-  c = vec4(first.yzw, last);
-}
-`;
-// By pairs of powers: one operation more than Horner's rule, but a chain of five that wait for one another instead of
-// nine. Software renderers draw this form faster (docs/internals/viewer.md).
-const WINDOW_POLYNOMIAL = `
-float windowV(float s, vec4 c) {
-  float square = s * s;
-  return (1.0 + s * c.x) + square * ((c.y + s * c.z) + square * (c.w + s));
+vec2 window(float t, float r) {
+  float h = 0.5 * r, distance = abs(t);
+  float lower = exp2(min(logistic2(distance - h), 40.0 * kLog2e));
+  float upper = exp2(max(-logistic2(distance + h), -126.0));  // what is smaller is no normal number
+  float y = 3.0 * kLogistic3 * r * t * t + r * (kLogistic1 + kLogistic3 * h * h);
+  return vec2(oneMinusExp(y, lower * upper), (1.0 + lower) * (1.0 + upper));
 }
 `;
 
 /// GLSL of the colour from spherical harmonics. Coefficients are packed four numbers to a texel.
 function harmonics(degree) {
-  const basis = [
-    '0.28209479177387814',
-    '-0.4886025119029199 * y', '0.4886025119029199 * z', '-0.4886025119029199 * x',
-    '1.0925484305920792 * x * y', '-1.0925484305920792 * y * z', '0.31539156525252005 * (2.0 * zz - xx - yy)',
-    '-1.0925484305920792 * x * z', '0.5462742152960396 * (xx - yy)',
-    '-0.5900435899266435 * y * (3.0 * xx - yy)', '2.890611442640554 * x * y * z',
-    '-0.4570457994644658 * y * (4.0 * zz - xx - yy)', '0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)',
-    '-0.4570457994644658 * x * (4.0 * zz - xx - yy)', '1.445305721320277 * z * (xx - yy)',
-    '-0.5900435899266435 * x * (xx - 3.0 * yy)',
-  ].slice(0, (degree + 1) ** 2);
-  const texels = texelsOfHarmonics(degree);
-  const number = k => `t${k >> 2}.${'xyzw'[k & 3]}`;
-  const lines = [
-    ...Array.from({ length: texels }, (_, k) => `vec4 t${k} = texelFetch(uHarmonics, at + ivec2(${k}, 0), 0);`),
-    'float x = direction.x, y = direction.y, z = direction.z, xx = x * x, yy = y * y, zz = z * z;',
-    ...basis.map((b, k) => `color += (${b}) * vec3(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`),
-  ];
+  const texels = texelsOfHarmonics(degree), number = k => `t${k >> 2}.${'xyzw'[k & 3]}`;
+  const read = Array.from({ length: texels }, (_, k) => `vec4 t${k} = texelFetch(uHarmonics, at + ivec2(${k}, 0), 0);`);
   return `
 vec3 colorSeenFrom(vec3 direction, ivec2 at) {
   vec3 color = vec3(0.5);
-  ${lines.join('\n  ')}
+  ${read.join('\n  ')}
+  float x = direction.x, y = direction.y, z = direction.z, xx = x * x, yy = y * y, zz = z * z;
+  ${addHarmonics(degree, number, 'vec3')}
   return max(color, 0.0);
 }
 `;
 }
 
 /// Texels that the harmonics of a splat take.
-export function texelsOfHarmonics(degree) {
-  return Math.ceil((3 * (degree + 1) ** 2) / 4);
-}
+export const texelsOfHarmonics = degree => harmonicNumbers(degree) / 4;
 
 export const FULL_SCREEN = `${HEAD}
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }
@@ -124,9 +88,10 @@ export function projectShader(kind, degree) {
   }
   vec2 inverse = 1.0 / vec2(s1, s2);
   whitening = vec4(axis * inverse.x, vec2(-axis.y, axis.x) * inverse.y);
-  peak = 2.0 * kPi * s1 * s2 * opacity * windowTop(inverse.x) * windowTop(inverse.y);
+  peak = opacity * (2.0 * kPi) * s1 * s2;
+  vec2 top = window(0.0, inverse.x) * window(0.0, inverse.y);
   vec2 widened = inverse * inverse / (1.0 + kPixelVariance * inverse * inverse);
-  level = 2.0 * log(peak / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
+  level = 2.0 * log(peak * top.x / top.y / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
   return `${HEAD}
 uniform sampler2D uGeometry, uHarmonics;
 uniform int uCount, uHarmonicsPerRow;
@@ -138,7 +103,7 @@ uniform float uVariance;
 layout(location = 0) out uvec4 outMean;
 layout(location = 1) out uvec4 outWhitening;
 layout(location = 2) out uvec4 outColor;
-${kind === 'window' ? WINDOW_TOP : ''}${harmonics(degree)}
+${kind === 'window' ? GL_WINDOW : ''}${harmonics(degree)}
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
@@ -182,14 +147,14 @@ ${{ window: turned, cumulants }[kind] ?? gaussian}
 
 // What differs between kinds of footprints: `varyings` go from vertex to fragment shader, `set` computes them from
 // whitening matrix W and peak, `alpha` is the body of a function of d = pixel - mean [px].
-const GAUSSIAN = {
+const GL_GAUSSIAN = {
   varyings: ['vec4 fW', 'float fPeak'],
   set: 'fW = kBase2 * W; fPeak = peak;',
   alpha: 'vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)); return exp2(fPeak - dot(z, z));',
 };
-const KINDS = {
-  gaussian: GAUSSIAN,
-  compensated: GAUSSIAN,
+export const GL_KINDS = {
+  gaussian: GL_GAUSSIAN,
+  compensated: GL_GAUSSIAN,
   cumulants: {
     varyings: ['vec4 fW', 'vec4 fX', 'vec4 fY', 'float fPeak'],  // fX, fY: c4, c6, linear, cap
     functions: {
@@ -218,25 +183,19 @@ float cumulantConstant(float t, float unit, float scale) {
   return exp2(fPeak - dot(z, z) - h.y - h.x);`,
   },
   window: {
-    varyings: ['vec4 fW', 'vec2 fFlat', 'vec4 fU', 'vec4 fV', 'float fPeak'],
-    functions: { vertex: WINDOW_COEFFICIENTS, fragment: WINDOW_POLYNOMIAL },
-    set: `vec2 u = W.xy, v = W.zw;
-  readWindow(u, fFlat.x, fU);
-  readWindow(v, fFlat.y, fV);
-  fW = vec4(u, v);
-  fPeak = peak;`,
-    alpha: `vec2 w = max(abs(vec2(dot(fW.xy, d), dot(fW.zw, d))) - fFlat, 0.0), s = w * w;
-  float V = windowV(s.x, fU) * windowV(s.y, fV), square = V * V;
-  return fPeak / (square * square);`,
+    varyings: ['vec4 fW', 'vec2 fR', 'float fPeak'],
+    functions: { fragment: GL_WINDOW },
+    set: 'fW = W; fR = vec2(length(W.xy), length(W.zw)); fPeak = peak;',
+    alpha: `vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
+  return fPeak * (u.x * v.x) / (u.y * v.y);`,
   },
 };
 
 const declare = (kind, direction) =>
-  KINDS[kind].varyings.map(varying => `flat ${direction} highp ${varying};`).join('\n');
+  GL_KINDS[kind].varyings.map(varying => `flat ${direction} highp ${varying};`).join('\n');
 
 /// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses.
-export function drawVertexShader(kind, samples) {
-  const reach = Math.max(...nodesOf(samples).flat().map(Math.abs));
+export function drawVertexShader(kind) {
   const ellipse = kind === 'window'
     ? 'vec2 r = vec2(length(W.xy), length(W.zw)), shrink = inversesqrt(1.0 + kPixelVariance * r * r);\n' +
       '  vec4 E = vec4(W.xy * shrink.x, W.zw * shrink.y);'
@@ -248,7 +207,7 @@ uniform vec2 uSize;
 flat out highp vec2 fMean;
 flat out highp vec3 fColor;
 ${declare(kind, 'out')}
-${KINDS[kind].functions?.vertex ?? ''}
+${GL_KINDS[kind].functions?.vertex ?? ''}
 ivec2 texelOf(int k) { return ivec2(k % ${SPLATS_PER_ROW}, k / ${SPLATS_PER_ROW}); }
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: not drawn
@@ -261,10 +220,10 @@ void main() {
   float peak = m.w;
   fMean = m.xy;
   fColor = uintBitsToFloat(texelFetch(uColor, texel, 0)).xyz;
-  ${KINDS[kind].set}
+  ${GL_KINDS[kind].set}
   ${ellipse}
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
-  float margin = ${glslNumber(reach + QUAD_MARGIN)};
+  const float margin = ${glslNumber(QUAD_MARGIN)};
   vec2 s = corner * (m.z + margin * vec2(abs(E.x) + abs(E.y), abs(E.z) + abs(E.w)));
   vec2 offset = vec2(E.w * s.x - E.y * s.y, E.x * s.y - E.z * s.x) / (E.x * E.w - E.y * E.z);
   gl_Position = vec4((m.xy + offset + 0.5) / uSize * 2.0 - 1.0, 0.0, 1.0);
@@ -272,37 +231,25 @@ void main() {
 `;
 }
 
-/// Writes premultiplied colour and alpha, for every one of `nodes` into a target of its own.
-export function drawFragmentShader(kind, nodes) {
-  const write = nodes.map(([x, y], k) => `o${k} = shade(d + vec2(${glslNumber(x)}, ${glslNumber(y)}));`);
+/// Writes premultiplied colour and alpha.
+export function drawFragmentShader(kind) {
   return `${HEAD}
 flat in highp vec2 fMean;
 flat in highp vec3 fColor;
 ${declare(kind, 'in')}
-${nodes.map((_, k) => `layout(location = ${k}) out vec4 o${k};`).join('\n')}
-${KINDS[kind].functions?.fragment ?? ''}
+out vec4 color;
+${GL_KINDS[kind].functions?.fragment ?? ''}
 float alphaAt(vec2 d) {
-  ${KINDS[kind].alpha}
-}
-vec4 shade(vec2 d) {
-  float raw = alphaAt(d), alpha = raw >= kAlphaMin ? min(raw, kAlphaMax) : 0.0;
-  return vec4(fColor * alpha, alpha);
+  ${GL_KINDS[kind].alpha}
 }
 void main() {
-  vec2 d = floor(gl_FragCoord.xy) - fMean;
-  ${write.join('\n  ')}
-  ${nodes.length === 1 ? 'if (o0.a == 0.0) discard;' : ''}
+  float raw = alphaAt(floor(gl_FragCoord.xy) - fMean);
+  if (!(raw >= kAlphaMin)) discard;
+  float alpha = min(raw, kAlphaMax);
+  color = vec4(fColor * alpha, alpha);
 }
 `;
 }
-
-/// Multiplies a picture by a number; blending adds the results up.
-export const ADD = `${HEAD}
-uniform sampler2D uPicture;
-uniform float uFactor;
-out vec4 color;
-void main() { color = uFactor * texelFetch(uPicture, ivec2(gl_FragCoord.xy), 0); }
-`;
 
 /// Shows one picture, two beside each other, or their difference. Row 0 of a picture is its top.
 export const PRESENT = `${HEAD}

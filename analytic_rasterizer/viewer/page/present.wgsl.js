@@ -1,0 +1,39 @@
+// WGSL that shows one picture on the canvas, two beside each other, or their difference.
+
+export const SCREEN_BYTES = 48;
+
+/// Numbers of the struct below.
+export const screenData = ({ canvas, size, divider, difference, background }) => {
+  const data = new ArrayBuffer(SCREEN_BYTES), floats = new Float32Array(data), words = new Uint32Array(data);
+  floats.set([...background, divider, canvas.width, canvas.height, difference ? 1 : 0, 0], 0);
+  words.set([size.width, size.height], 8);
+  return data;
+};
+
+/// `full` is the difference that the heat map shows in its last colour. Pictures hold colour and transmittance.
+export const present = full => `
+struct Screen { background: vec3f, divider: f32, canvas: vec2f, difference: f32, unused: f32, size: vec2u }
+@group(0) @binding(0) var<uniform> screen: Screen;
+@group(0) @binding(1) var<storage, read> left: array<vec4f>;
+@group(0) @binding(2) var<storage, read> right: array<vec4f>;
+@vertex fn corner(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
+  return vec4f(select(-1.0, 3.0, i == 1u), select(-1.0, 3.0, i == 2u), 0.0, 1.0);
+}
+fn over(c: vec4f) -> vec3f { return clamp(c.xyz + c.w * screen.background, vec3f(0.0), vec3f(1.0)); }
+fn heat(part: f32) -> vec3f {
+  let k0 = vec3f(0.03, 0.03, 0.06); let k1 = vec3f(0.32, 0.10, 0.45); let k2 = vec3f(0.80, 0.26, 0.30);
+  let k3 = vec3f(0.98, 0.65, 0.18); let k4 = vec3f(1.00, 0.98, 0.85);
+  let t = part * 4.0;
+  if (t < 2.0) { return select(mix(k1, k2, t - 1.0), mix(k0, k1, t), t < 1.0); }
+  return select(mix(k3, k4, t - 3.0), mix(k2, k3, t - 2.0), t < 3.0);
+}
+@fragment fn show(@builtin(position) at: vec4f) -> @location(0) vec4f {
+  let pixel = min(vec2u(at.xy / screen.canvas * vec2f(screen.size)), screen.size - 1u);
+  let k = pixel.y * screen.size.x + pixel.x;
+  let a = over(left[k]); let b = over(right[k]);
+  if (screen.difference > 0.0) {
+    let d = abs(a - b);
+    return vec4f(heat(min(max(d.x, max(d.y, d.z)) / ${full}, 1.0)), 1.0);
+  }
+  return vec4f(select(b, a, at.x < screen.divider), 1.0);
+}`;

@@ -1,0 +1,85 @@
+// WGSL of the projection, after csrc/core/project.h and camera/pinhole.h: one thread turns a Gaussian into a splat, and
+// counts its tiles.
+
+import { support } from './bin.wgsl.js';
+import { KINDS } from './footprint.wgsl.js';
+import { FRAME, WORKGROUP } from './frame.wgsl.js';
+import { addHarmonics, harmonicNumbers } from './sh.js';
+
+function colorOf(degree) {
+  const words = harmonicNumbers(degree) / 2, number = k => `t${k >> 1}.${'xy'[k & 1]}`;
+  return `
+fn colorOf(i: u32, direction: vec3f) -> vec3f {
+  let at = i * ${words}u;
+  ${Array.from({ length: words }, (_, k) => `let t${k} = unpack2x16float(harmonics[at + ${k}u]);`).join('\n  ')}
+  let x = direction.x; let y = direction.y; let z = direction.z; let xx = x * x; let yy = y * y; let zz = z * z;
+  var color = vec3f(0.5);
+  ${addHarmonics(degree, number, 'vec3f')}
+  return max(color, vec3f(0.0));
+}`;
+}
+
+export const project = (kind, degree) => `${FRAME}${KINDS[kind].functions}
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> geometry: array<vec4f>;  // mean, opacity; scale, 0; quaternion w x y z
+@group(0) @binding(2) var<storage, read> harmonics: array<u32>;
+@group(0) @binding(3) var<storage, read_write> splats: array<Splat>;
+@group(0) @binding(4) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(5) var<storage, read_write> tiles: array<u32>;
+${support(kind)}${colorOf(degree)}
+// Keeps a compiler from fusing a product with a sum, which it cannot undo: frame.zero is 0 at run time only. Depths have
+// to be the rasterizer's to the last bit, since they order the splats.
+fn rounded(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ frame.zero); }
+fn row(r: vec4f, p: vec3f) -> f32 {
+  return rounded(rounded(rounded(rounded(r.x * p.x) + rounded(r.y * p.y)) + rounded(r.z * p.z)) + r.w);
+}
+fn within(x: f32, bound: f32) -> bool { return abs(x) <= bound; }
+
+@compute @workgroup_size(${WORKGROUP})
+fn main(@builtin(global_invocation_id) id: vec3u, @builtin(num_workgroups) groups: vec3u) {
+  let i = id.y * groups.x * ${WORKGROUP}u + id.x;
+  if (i >= frame.count) { return; }
+  keys[i] = 0xffffffffu;
+  tiles[i] = 0u;
+  let g0 = geometry[3u * i]; let mean = g0.xyz; let opacity = g0.w;
+  let view = vec3f(row(frame.viewX, mean), row(frame.viewY, mean), row(frame.viewZ, mean));
+  if (!(view.z > kNear)) { return; }
+  let scale = geometry[3u * i + 1u].xyz; let q = geometry[3u * i + 2u];
+  if (!(within(scale.x, kMaxScale) && within(scale.y, kMaxScale) && within(scale.z, kMaxScale))) { return; }
+  let ratio = view.xy / view.z;
+  let centre = frame.pinhole.xy * ratio + frame.pinhole.zw - 0.5;
+  let held = clamp(ratio, -frame.limit, frame.limit);
+  let jx = frame.pinhole.x / view.z * (frame.viewX.xyz - held.x * frame.viewZ.xyz);
+  let jy = frame.pinhole.y / view.z * (frame.viewY.xyz - held.y * frame.viewZ.xyz);
+  let r0 = vec3f(1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z - q.x * q.w), 2.0 * (q.y * q.w + q.x * q.z));
+  let r1 = vec3f(2.0 * (q.y * q.z + q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w - q.x * q.y));
+  let r2 = vec3f(2.0 * (q.y * q.w - q.x * q.z), 2.0 * (q.z * q.w + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
+  let vx = (jx.x * r0 + jx.y * r1 + jx.z * r2) * scale;
+  let vy = (jy.x * r0 + jy.y * r1 + jy.z * r2) * scale;
+  // The determinant is never xx yy - xy xy, which is negative for half of all long needles.
+  let normal = cross(vx, vy);
+  let xx = dot(vx, vx); let xy = dot(vx, vy); let yy = dot(vy, vy); let det = dot(normal, normal);
+  if (!(det >= 0.0 && det < kMaxDet && within(xx, 1e18) && within(yy, 1e18) && opacity <= kMaxOpacity)) { return; }
+  var s: Splat;
+${KINDS[kind].shape}
+  let drawn = level > 0.0 && level <= 1e6 && largest <= kMaxWhitening;
+  if (!(drawn && within(centre.x, 1e9) && within(centre.y, 1e9))) { return; }
+  s.c = vec4f(0.0, 0.0, 0.0, level);
+  let area = supportOf(s, frame.reach);
+  let half = area.halfWidth + area.reach;
+  let columns = columnsWithin(centre.x - half, centre.x + half);
+  let rows = rowsOf(area);
+  if (columns.x > columns.y || rows.x > rows.y) { return; }
+  var count = 0u;
+  let tileRows = tilesOf(rows);
+  for (var r = tileRows.x; r <= tileRows.y; r++) {
+    let c = tileColumnsOf(area, rows, r);
+    count += u32(max(c.y - c.x + 1, 0));
+  }
+  if (count == 0u) { return; }
+  let fromEye = mean - frame.eye.xyz;
+  s.c = vec4f(colorOf(i, fromEye / sqrt(dot(fromEye, fromEye))), level);
+  splats[i] = s;
+  tiles[i] = count;
+  keys[i] = bitcast<u32>(view.z);
+}`;

@@ -1,0 +1,23 @@
+// Spherical harmonics, csrc/core/sh.h, as text that GLSL and WGSL have in common. (x, y, z) is the direction; xx, yy
+// and zz are the squares.
+
+const BASIS = [
+  '0.28209479177387814',
+  '-0.4886025119029199 * y', '0.4886025119029199 * z', '-0.4886025119029199 * x',
+  '1.0925484305920792 * x * y', '-1.0925484305920792 * y * z', '0.31539156525252005 * (2.0 * zz - xx - yy)',
+  '-1.0925484305920792 * x * z', '0.5462742152960396 * (xx - yy)',
+  '-0.5900435899266435 * y * (3.0 * xx - yy)', '2.890611442640554 * x * y * z',
+  '-0.4570457994644658 * y * (4.0 * zz - xx - yy)', '0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)',
+  '-0.4570457994644658 * x * (4.0 * zz - xx - yy)', '1.445305721320277 * z * (xx - yy)',
+  '-0.5900435899266435 * x * (xx - 3.0 * yy)',
+];
+
+/// Statements that add the harmonics up to a degree to `color`. `number(k)` is text for number k of a Gaussian, and
+/// `vector` the name of a type of three floats.
+export function addHarmonics(degree, number, vector) {
+  return BASIS.slice(0, (degree + 1) ** 2).map((basis, k) =>
+    `color += (${basis}) * ${vector}(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`).join('\n  ');
+}
+
+/// Numbers that the harmonics of a Gaussian take: a multiple of four.
+export const harmonicNumbers = degree => 4 * Math.ceil((3 * (degree + 1) ** 2) / 4);

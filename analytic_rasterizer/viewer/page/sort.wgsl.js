@@ -1,0 +1,146 @@
+// WGSL of a stable radix sort of (key, value), 4 bits at a time: histograms of blocks of keys; for each digit a
+// workgroup adds them up over the blocks; scatter. No workgroup waits for another one, so that no forward progress is
+// needed, and no subgroups.
+
+import { WORKGROUP } from './frame.wgsl.js';
+
+export const SORT_BITS = 4;
+const SORT_ITEMS = 8;                            // keys of a thread
+export const SORT_BLOCK = WORKGROUP * SORT_ITEMS;  // of a workgroup
+
+const SORT = `
+struct Pass { shift: u32, source: u32, first: u32, zero: u32 }  // source: of counts; first: drop keys 0xffffffff
+@group(0) @binding(0) var<uniform> pass_: Pass;
+@group(0) @binding(1) var<storage, read> counts: array<u32>;
+fn blocksOf(n: u32) -> u32 { return (n + ${SORT_BLOCK - 1}u) / ${SORT_BLOCK}u; }
+`;
+
+/// Sums over the threads of a workgroup, of one number of each, at most 2^32 - 1. Ends with a barrier.
+export const GROUP_SCAN = `
+var<workgroup> sums: array<u32, ${WORKGROUP}>;
+fn saturated(a: u32, b: u32) -> u32 { return select(a + b, 0xffffffffu, a + b < a); }
+fn inclusive(t: u32, x: u32) -> u32 {
+  var sum = x;
+  sums[t] = sum;
+  workgroupBarrier();
+  for (var step = 1u; step < ${WORKGROUP}u; step <<= 1u) {
+    var other = 0u;
+    if (t >= step) { other = sums[t - step]; }
+    workgroupBarrier();
+    sum = saturated(sum, other);
+    sums[t] = sum;
+    workgroupBarrier();
+  }
+  return sum;
+}
+`;
+
+export const SORT_COUNT = `${SORT}
+@group(0) @binding(2) var<storage, read> keysIn: array<u32>;
+@group(0) @binding(3) var<storage, read_write> histogram: array<u32>;
+var<workgroup> bins: array<atomic<u32>, 16>;
+@compute @workgroup_size(${WORKGROUP})
+fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+  let n = counts[pass_.source]; let blocks = blocksOf(n);
+  if (t < 16u) { atomicStore(&bins[t], 0u); }
+  workgroupBarrier();
+  for (var k = 0u; k < ${SORT_ITEMS}u; k++) {
+    let at = block.x * ${SORT_BLOCK}u + k * ${WORKGROUP}u + t;
+    if (at < n) {
+      let key = keysIn[at];
+      if (pass_.first == 0u || key != 0xffffffffu) { atomicAdd(&bins[(key >> pass_.shift) & 15u], 1u); }
+    }
+  }
+  workgroupBarrier();
+  if (t < 16u && block.x < blocks) { histogram[t * blocks + block.x] = atomicLoad(&bins[t]); }
+}`;
+
+export const SORT_SCAN = `${SORT}${GROUP_SCAN}
+@group(0) @binding(2) var<storage, read_write> histogram: array<u32>;
+@group(0) @binding(3) var<storage, read_write> totals: array<u32>;
+var<workgroup> sharedBlocks: u32;
+@compute @workgroup_size(${WORKGROUP})
+fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) digit: vec3u) {
+  if (t == 0u) { sharedBlocks = blocksOf(counts[pass_.source]); }
+  let blocks = workgroupUniformLoad(&sharedBlocks);
+  var before = 0u;
+  for (var first = 0u; first < blocks; first += ${WORKGROUP}u) {
+    let at = first + t;
+    var x = 0u;
+    if (at < blocks) { x = histogram[digit.x * blocks + at]; }
+    let sum = inclusive(t, x);
+    if (at < blocks) { histogram[digit.x * blocks + at] = before + sum - x; }
+    before += sums[${WORKGROUP - 1}];
+    workgroupBarrier();
+  }
+  if (t == 0u) { totals[digit.x] = before; }
+}`;
+
+export const SORT_SCATTER = `${SORT}
+@group(0) @binding(2) var<storage, read> keysIn: array<u32>;
+@group(0) @binding(3) var<storage, read> valuesIn: array<u32>;
+@group(0) @binding(4) var<storage, read_write> keysOut: array<u32>;
+@group(0) @binding(5) var<storage, read_write> valuesOut: array<u32>;
+@group(0) @binding(6) var<storage, read> histogram: array<u32>;
+@group(0) @binding(7) var<storage, read> totals: array<u32>;
+// places[d * WORKGROUP + t]: how many keys of digit d (low half) and d + 8 (high half) thread t has; then, how many come
+// before them in the block.
+var<workgroup> places: array<u32, ${8 * WORKGROUP}>;
+var<workgroup> parts: array<u32, ${WORKGROUP}>;
+var<workgroup> starts: array<u32, 16>;
+@compute @workgroup_size(${WORKGROUP})
+fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+  let n = counts[pass_.source]; let blocks = blocksOf(n);
+  for (var d = 0u; d < 8u; d++) { places[d * ${WORKGROUP}u + t] = 0u; }
+  if (t < 16u && block.x < blocks) {
+    var before = histogram[t * blocks + block.x];
+    for (var d = 0u; d < t; d++) { before += totals[d]; }
+    starts[t] = before;
+  }
+  let begin = block.x * ${SORT_BLOCK}u + t * ${SORT_ITEMS}u;  // a thread's keys are consecutive: the sort is stable
+  var key: array<u32, ${SORT_ITEMS}>;
+  for (var k = 0u; k < ${SORT_ITEMS}u; k++) {
+    let at = begin + k;
+    key[k] = 0xffffffffu;
+    if (at < n) {
+      key[k] = keysIn[at];
+      if (pass_.first == 0u || key[k] != 0xffffffffu) {
+        let digit = (key[k] >> pass_.shift) & 15u;
+        places[(digit & 7u) * ${WORKGROUP}u + t] += select(1u, 65536u, digit >= 8u);
+      }
+    }
+  }
+  workgroupBarrier();
+  // 32 threads for each pair of digits add up 8 numbers each.
+  var sum = 0u;
+  for (var k = 0u; k < 8u; k++) { sum += places[8u * t + k]; }
+  parts[t] = sum;
+  workgroupBarrier();
+  var all = sum;
+  for (var step = 1u; step < 32u; step <<= 1u) {
+    var other = 0u;
+    if ((t & 31u) >= step) { other = parts[t - step]; }
+    workgroupBarrier();
+    all += other;
+    parts[t] = all;
+    workgroupBarrier();
+  }
+  var before = all - sum;
+  for (var k = 0u; k < 8u; k++) {
+    let x = places[8u * t + k];
+    places[8u * t + k] = before;
+    before += x;
+  }
+  workgroupBarrier();
+  for (var k = 0u; k < ${SORT_ITEMS}u; k++) {
+    let at = begin + k;
+    if (at < n && (pass_.first == 0u || key[k] != 0xffffffffu)) {
+      let digit = (key[k] >> pass_.shift) & 15u; let high = digit >= 8u;
+      let cell = (digit & 7u) * ${WORKGROUP}u + t; let both = places[cell];
+      let to = starts[digit] + select(both & 65535u, both >> 16u, high);
+      places[cell] = both + select(1u, 65536u, high);
+      keysOut[to] = key[k];
+      if (pass_.first != 0u) { valuesOut[to] = at; } else { valuesOut[to] = valuesIn[at]; }
+    }
+  }
+}`;

@@ -1,0 +1,335 @@
+// The viewer: its state, and the loop that draws when something has changed.
+
+import { readAddress, writeAddress } from './address.js';
+import { Camera, add, between, depthAt, times } from './camera.js';
+import { parseFootprint } from './constants.js';
+import { Interface, READING_TIME, announce, showFailure } from './interface.js';
+import { Pace } from './pace.js';
+import { openRenderer } from './renderers.js';
+import { WebGLRenderer } from './webgl.js';
+
+const REST_AFTER = 200;         // ms without motion
+const TRAVEL_TIME = 450;        // ms of the way to another pose
+const FLIGHT_SPEED = 0.7;       // distances of the target per second
+const LOSS_TIME = 500;          // ms in which a device that is lost says so
+
+export class Viewer {
+  /// `wish` and `bits` are those of openRenderer.
+  constructor(meta, wish, bits) {
+    Object.assign(this, { meta, wish, bits });
+    this.surface = document.getElementById('surface');
+    this.camera = new Camera(meta);
+    this.state = {
+      footprint: meta.footprint, compare: null, mode: 'split', divisor: 1, divider: 0.5, background: meta.background,
+    };
+    this.atView = true;  // nothing has moved the camera away from the view
+    this.frameRequested = false;
+    this.drawing = false;  // the device is at work on a frame
+    this.again = false;    // and then there is another one to draw
+    this.movedAt = -Infinity;
+    this.rate = null;
+    this.losses = 0;
+    this.controls = null;
+    this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
+    this.paces = new Map();
+    this.settledTime = 0;  // ms
+  }
+
+  /// Opens a renderer for the scene, which is not here yet.
+  async open() {
+    Object.assign(this, await openRenderer(this.meta, this.wish, this.bits));
+    this.canvas = this.renderer.canvas;
+  }
+
+  /// Takes the scene, which loadScene returned.
+  async load(scene) {
+    const { renderer } = this;
+    this.scene = scene;
+    try {
+      await renderer.load(scene);
+    } catch (error) {
+      await this.replace(renderer, error);
+      return;
+    }
+    renderer.lost.then(() => this.replace(renderer)).catch(() => {});  // which has said why
+  }
+
+  /// Another renderer in place of one whose device was lost: the same once, then WebGL 2; or of WebGPU that failed.
+  async replace(renderer, failure = null) {
+    if (failure && renderer instanceof WebGLRenderer) throw failure;
+    if (this.renderer === renderer && this.replaced !== renderer) {
+      this.replaced = renderer;
+      this.recovery = this.recover(renderer, failure);
+    }
+    await this.recovery;
+  }
+
+  async recover(renderer, failure) {
+    announce('The graphics device was taken away; waiting for it to come back.');
+    if (!failure) await renderer.returned;
+    renderer.dispose();
+    this.shown = null;
+    if (!(renderer instanceof WebGLRenderer)) this.losses += 1;
+    if (failure || this.losses > 1) this.wish = 'webgl';
+    try {
+      await this.open();
+      if (failure) this.reason = `WebGPU failed here. ${failure.message}`;
+      else if (this.losses > 1) this.reason = 'WebGPU lost the graphics device twice.';
+      await this.load(this.scene);
+    } catch (error) {
+      showFailure(error.message);
+      throw error;
+    }
+    announce('');
+    this.controls?.showRenderer();
+    this.controls?.update();
+    this.wake();
+  }
+
+  /// Starts to draw for the user.
+  interact() {
+    readAddress(this);
+    this.controls = new Interface(this);
+    new ResizeObserver(() => this.wake()).observe(this.surface);
+    window.addEventListener('hashchange', () => {
+      readAddress(this);
+      this.controls.update();
+      this.wake();
+    });
+    this.wake();
+  }
+
+  // ------------------------------------------------------------------ what the user asks for
+
+  change(part) {
+    Object.assign(this.state, part);
+    this.controls.update();
+    this.wake();
+    this.restLater();
+  }
+
+  orbit(right, down) {
+    this.camera.orbit(right, down);
+    this.moved();
+  }
+
+  pan(x, y) {
+    const pinhole = this.pinhole(), ratio = window.devicePixelRatio || 1;
+    const { distance } = this.camera;
+    this.camera.move((-x * ratio * distance) / pinhole.fx, (-y * ratio * distance) / pinhole.fy, 0);
+    this.moved();
+  }
+
+  /// By parts of the distance.
+  panBy(x, y) {
+    this.camera.move(x * this.camera.distance, y * this.camera.distance, 0);
+    this.moved();
+  }
+
+  dolly(factor) {
+    this.camera.dolly(factor);
+    this.moved();
+  }
+
+  focusOn(x, y) {
+    const pinhole = this.pinhole(), ratio = window.devicePixelRatio || 1;
+    const depth = depthAt(this.scene.geometry, pinhole, x * ratio, y * ratio);
+    if (depth === null) {
+      announce('There is nothing here to focus on.', READING_TIME);
+      return;
+    }
+    const point = add(this.camera.position, times(this.camera.ray(pinhole, x * ratio, y * ratio), depth));
+    this.travel(this.camera.poseTowards(point), () => {});
+  }
+
+  stepView(step) {
+    const count = this.meta.views.length;
+    this.goToView((this.camera.view + step + count) % count);
+  }
+
+  goToView(k) {
+    this.camera.view = k;
+    this.camera.lens = this.meta.views[k];
+    this.controls.update();
+    announce(`View ${this.meta.views[k].name}`, READING_TIME);
+    this.travel(this.camera.poseOfView(k), () => { this.atView = true; });
+  }
+
+  /// Moves to a pose, at once for people who prefer no motion.
+  travel(pose, arrived) {
+    const still = matchMedia('(prefers-reduced-motion: reduce)').matches;
+    this.journey = { from: this.camera.pose, to: pose, start: still ? -Infinity : performance.now(), arrived };
+    this.moved(true);
+  }
+
+  /// Of what is on the screen: the divider and the heat map too.
+  saveScreenshot() {
+    if (!this.shown) return;
+    const name = `${this.meta.name.replace(/\.\w+$/, '')}_${this.state.footprint.replace(/\W+/g, '_')}.png`;
+    this.present();
+    this.canvas.toBlob(blob => {
+      const link = document.createElement('a');
+      link.href = URL.createObjectURL(blob);
+      link.download = name;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+      announce(`Saved ${name}`, READING_TIME);
+    });
+  }
+
+  /// An entry of the footprints. Throws for an unknown name.
+  footprint(name) {
+    return parseFootprint(name, this.meta.footprints);
+  }
+
+  /// What is drawn for this name: a quicker footprint while the camera moves, and where the renderer cannot draw it.
+  drawn(name, moving = false) {
+    const wanted = this.footprint(name);
+    return moving || !this.renderer.draws(wanted) ? this.footprint(wanted.instead ?? wanted.name) : wanted;
+  }
+
+  // ------------------------------------------------------------------ the loop
+
+  /// Has a frame drawn soon.
+  wake() {
+    this.again = this.drawing;
+    if (!this.controls || this.frameRequested || this.drawing || this.renderer.isLost) return;  // or automation
+    this.frameRequested = true;
+    this.surface.setAttribute('aria-busy', 'true');
+    requestAnimationFrame(() => this.frame());
+  }
+
+  moved(onJourney = false) {
+    if (!onJourney) this.journey = null;
+    this.atView = false;
+    this.movedAt = performance.now();
+    this.wake();
+    this.restLater();
+  }
+
+  /// When the camera has rested for a while: everything in full, and the address.
+  restLater() {
+    clearTimeout(this.restTimer);
+    this.restTimer = setTimeout(() => {
+      this.rate = null;
+      writeAddress(this);
+      this.wake();
+    }, REST_AFTER + 20);  // timers may be early
+  }
+
+  get moving() {
+    return performance.now() - this.movedAt < REST_AFTER;
+  }
+
+  /// Size of the canvas that fills the page [px].
+  get size() {
+    const ratio = window.devicePixelRatio || 1, { clientWidth, clientHeight } = this.surface;
+    return [clientWidth, clientHeight].map(side => Math.max(1, Math.round(side * ratio)));
+  }
+
+  /// The camera of the canvas, at a resolution 1/divisor of it.
+  pinhole(divisor = 1) {
+    const [width, height] = this.size, p = this.camera.pinhole(width, height, false, this.atView);
+    const w = Math.max(1, Math.round(width / divisor)), h = Math.max(1, Math.round(height / divisor));
+    const x = w / width, y = h / height;
+    return { ...p, width: w, height: h, fx: p.fx * x, fy: p.fy * y, cx: p.cx * x, cy: p.cy * y };
+  }
+
+  async frame() {
+    this.frameRequested = false;
+    const { renderer } = this, start = performance.now();
+    if (renderer.isLost) return;
+    this.animate(start, Math.min((start - (this.lastFrame ?? start)) / 1000, 0.2));
+    this.lastFrame = start;
+    this.drawing = true;
+    this.again = false;
+    let done = false;
+    try {
+      done = await this.drawFrame();
+    } catch (error) {
+      if (!await this.wasLost(renderer)) this.replace(renderer, error).catch(() => showFailure(error.message));
+      return;  // another renderer wakes the loop
+    } finally {
+      this.drawing = false;
+    }
+    const active = this.moving || this.journey || this.controls.flight();
+    if (done) this.noteTime(start, active);
+    if (active || this.again || !done) this.wake();
+    else if (!this.shown.moving) this.surface.setAttribute('aria-busy', 'false');  // what is shown is what is asked for
+  }
+
+  /// Moves along a journey, or with the keys that are held.
+  animate(now, seconds) {
+    if (this.journey) {
+      const { from, to, start, arrived } = this.journey, part = Math.min((now - start) / TRAVEL_TIME, 1);
+      this.camera.pose = part < 1 ? between(from, to, part * part * (3 - 2 * part)) : to;
+      if (part < 1) this.moved(true);
+      else {
+        this.journey = null;
+        arrived();
+        this.restLater();
+      }
+    }
+    const flight = this.controls.flight();
+    if (flight) {
+      this.camera.move(...times(flight, FLIGHT_SPEED * this.camera.distance * seconds));
+      this.moved();
+    }
+  }
+
+  /// Draws the state and shows it. Pictures are quicker and may be smaller while the camera moves; others are given up
+  /// when it begins to. False if there is no picture.
+  async drawFrame() {
+    const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
+    const left = this.drawn(footprint, moving), right = compare === null ? null : this.drawn(compare, moving);
+    const pace = moving ? this.paceOf(left, right) : null;
+    const camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
+    const split = right !== null && mode === 'split', column = Math.ceil(divider * camera.width);
+    const pictures = [{ name: 'left', footprint: left, span: split ? [0, column] : undefined }];
+    if (right !== null) {
+      const span = split ? [Math.max(column - 1, 0), camera.width] : undefined;
+      pictures.push({ name: 'right', footprint: right, span });
+    }
+    const start = performance.now(), cancelled = () => !moving && this.moving;
+    if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
+    const took = performance.now() - start;
+    if (moving) pace.note(took);
+    else this.settledTime = took;
+    this.shown = { left: 'left', right: right === null ? null : 'right', camera, moving };
+    this.present();
+    return true;
+  }
+
+  /// The pace at which these footprints can follow the camera.
+  paceOf(left, right) {
+    const key = `${left.name} ${right?.name}`;
+    if (!this.paces.has(key)) this.paces.set(key, new Pace(this.settledTime));
+    return this.paces.get(key);
+  }
+
+  /// Shows what was drawn last.
+  present() {
+    const { mode, divider, background } = this.state, { left, right } = this.shown, [width, height] = this.size;
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    const difference = right !== null && mode === 'difference';
+    this.renderer.present({ left, right, divider: divider * width, difference, background });
+  }
+
+  noteTime(start, active) {
+    const now = performance.now(), { width, height } = this.shown.camera;
+    if (this.moving && this.lastDrawn) {
+      const rate = 1000 / Math.max(now - this.lastDrawn, 1);
+      this.rate = this.rate === null ? rate : 0.8 * this.rate + 0.2 * rate;
+    }
+    this.lastDrawn = active ? now : null;
+    this.controls.showFigures(width, height, now - start, this.rate);
+  }
+
+  /// Whether an error was that the device is lost, which may be told a little later.
+  async wasLost(renderer) {
+    const late = new Promise(resolve => setTimeout(resolve, LOSS_TIME));
+    await Promise.race([renderer.lost, late]);
+    return renderer.isLost;
+  }
+}

@@ -1,0 +1,182 @@
+// The passes of a picture with WebGPU: their buffers, pipelines and order. Default limits are enough for all of them: at
+// most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. No feature that is optional is used.
+
+import {
+  COUNT_VISIBLE, RANGES, SCAN_APPLY, SCAN_BLOCK, SCAN_BLOCKS, SCAN_REDUCE, emit,
+} from './bin.wgsl.js';
+import { blend } from './blend.wgsl.js';
+import { FRAME_BYTES, TILE, WORKGROUP } from './frame.wgsl.js';
+import { project } from './project.wgsl.js';
+import { harmonicNumbers } from './sh.js';
+import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './sort.wgsl.js';
+
+const MOST_WORKGROUPS = 65535;  // along one direction
+const SPLAT_BYTES = 48;
+const FIRST_ROOM = 65536;       // pairs, at least
+// Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
+const VISIBLE_SORT = 0, VISIBLE_SCAN = 16, VISIBLE_EMIT = 32, PAIRS_SORT = 48;
+
+/// Bytes of the largest binding that a scene needs.
+export const largestBinding = (count, degree) => count * Math.max(SPLAT_BYTES, 2 * harmonicNumbers(degree));
+
+/// Pipelines and bind groups, each made once.
+class Pipelines {
+  constructor(device) {
+    this.device = device;
+    this.made = new Map();
+    this.groups = new Map();
+  }
+
+  /// Compiles what these steps need. Rejects with the compiler's message.
+  async prepare(steps) {
+    const missing = new Map(steps.filter(({ key }) => !this.made.has(key)).map(step => [step.key, step]));
+    await Promise.all([...missing.values()].map(async ({ key, code }) => {
+      const module = this.device.createShaderModule({ code: code(), label: key });
+      this.made.set(key, await this.device.createComputePipelineAsync({
+        layout: 'auto', compute: { module, entryPoint: 'main' }, label: key,
+      }));
+    }));
+  }
+
+  encode(pass, { key, buffers, size }) {
+    const pipeline = this.made.get(key), name = [key, ...buffers.map(buffer => buffer.label)].join();
+    if (!this.groups.has(name)) {
+      this.groups.set(name, this.device.createBindGroup({
+        layout: pipeline.getBindGroupLayout(0),
+        entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })),
+      }));
+    }
+    pass.setPipeline(pipeline);
+    pass.setBindGroup(0, this.groups.get(name));
+    if (size.indirect) pass.dispatchWorkgroupsIndirect(size.indirect, size.offset);
+    else pass.dispatchWorkgroups(...size);
+  }
+}
+
+export class Passes {
+  /// Uploads the scene, which loadScene returned.
+  constructor(device, { meta, geometry, harmonics }) {
+    this.device = device;
+    this.pipelines = new Pipelines(device);
+    this.count = meta.count;
+    this.degree = meta.sh_degree;
+    this.numbered = 0;
+    this.uniforms = new Map();
+    this.room = 0;
+    const n = this.count, words = 4 * n;
+    this.geometry = this.buffer(geometry.byteLength, geometry);
+    this.harmonics = this.buffer(harmonics.byteLength, harmonics);
+    this.splats = this.buffer(SPLAT_BYTES * n);
+    this.depths = [this.buffer(words), this.buffer(words)];
+    this.order = [this.buffer(words), this.buffer(words)];
+    this.tiles = this.buffer(words);
+    this.offsets = this.buffer(words);
+    this.blocks = this.buffer(4 * (Math.ceil(n / SCAN_BLOCK) + 1));
+    this.counts = this.buffer(16, new Uint32Array([n, 0, 0, 0]));
+    this.arguments = this.buffer(64, null, GPUBufferUsage.INDIRECT);
+    this.totals = this.buffer(64);
+    this.frame = this.uniform(FRAME_BYTES);
+    this.reserve(Math.max(2 * n, FIRST_ROOM));
+  }
+
+  buffer(bytes, data = null, usage = 0) {
+    const { STORAGE, COPY_DST, COPY_SRC } = GPUBufferUsage;
+    const size = Math.max(4 * Math.ceil(bytes / 4), 16), label = `${++this.numbered}`;
+    const buffer = this.device.createBuffer({ size, label, usage: STORAGE | COPY_DST | COPY_SRC | usage });
+    if (data) this.device.queue.writeBuffer(buffer, 0, data);
+    return buffer;
+  }
+
+  uniform(size) {
+    const { UNIFORM, COPY_DST } = GPUBufferUsage;
+    return this.device.createBuffer({ size, label: `${++this.numbered}`, usage: UNIFORM | COPY_DST });
+  }
+
+  /// A uniform of four whole numbers that never change.
+  constant(...words) {
+    const key = words.join();
+    if (!this.uniforms.has(key)) {
+      const buffer = this.uniform(16);
+      this.device.queue.writeBuffer(buffer, 0, new Uint32Array(words));
+      this.uniforms.set(key, buffer);
+    }
+    return this.uniforms.get(key);
+  }
+
+  /// Pairs that a binding can have.
+  get mostPairs() {
+    return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4);
+  }
+
+  /// Makes room for so many pairs, or as many as a binding can have, and forgets those that there were.
+  reserve(room) {
+    this.room = Math.min(room, this.mostPairs);
+    for (const buffer of [...(this.pairKeys ?? []), ...(this.pairs ?? []), this.histogram]) buffer?.destroy();
+    this.pairKeys = [this.buffer(4 * this.room), this.buffer(4 * this.room)];
+    this.pairs = [this.buffer(4 * this.room), this.buffer(4 * this.room)];
+    this.histogram = this.buffer(64 * (Math.ceil(Math.max(this.room, this.count) / SORT_BLOCK) + 1));
+    this.pipelines.groups.clear();
+  }
+
+  indirect(offset) {
+    return { indirect: this.arguments, offset };
+  }
+
+  /// Steps of a stable sort by `bits`. `source` is the place of their number in counts. [keys, values] are pairs of
+  /// buffers; the result is in the first ones.
+  *sort(keys, values, bits, source, offset, drops) {
+    for (let shift = 0; shift < bits; shift += SORT_BITS) {
+      const first = drops && shift === 0, uniform = this.constant(shift, first ? 0 : source, first ? 1 : 0, 0);
+      const size = first ? [Math.ceil(this.count / SORT_BLOCK)] : this.indirect(offset);
+      const { counts, histogram, totals } = this;
+      yield { key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
+      yield { key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
+        size: [2 ** SORT_BITS] };
+      yield { key: 'sort scatter', code: () => SORT_SCATTER,
+        buffers: [uniform, counts, keys[0], values[0], keys[1], values[1], histogram, totals], size };
+      keys.reverse();
+      values.reverse();
+      if (first) {
+        yield { key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments], size: [1] };
+      }
+    }
+  }
+
+  /// The steps that fill the lists of a picture with this many columns and rows of tiles, and then
+  /// `blended(first row, rows)`, a step that draws some of its rows.
+  steps(footprint, [columns, rows], width, ranges, picture) {
+    const { counts, tiles, offsets, blocks, splats, frame, degree } = this, { kind } = footprint;
+    const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
+    const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
+    const steps = [
+      { key: `project ${kind} ${degree}`, code: () => project(kind, degree),
+        buffers: [frame, this.geometry, this.harmonics, splats, depths[0], tiles],
+        size: [across, Math.ceil(groups / across)] },
+      ...this.sort(depths, order, 32, 1, VISIBLE_SORT, true),
+      { key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
+        size: this.indirect(VISIBLE_SCAN) },
+      { key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments], size: [1] },
+      { key: 'scan apply', code: () => SCAN_APPLY, buffers: [counts, order[0], tiles, blocks, offsets],
+        size: this.indirect(VISIBLE_SCAN) },
+      { key: `emit ${kind}`, code: () => emit(kind),
+        buffers: [frame, counts, order[0], offsets, tiles, splats, pairKeys[0], pairs[0]],
+        size: this.indirect(VISIBLE_EMIT) },
+      ...this.sort(pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
+      { key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges], size: this.indirect(PAIRS_SORT) },
+    ];
+    const blended = (first, number) => ({
+      key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
+      buffers: [frame, this.constant(first, 0, 0, 0), ranges, pairs[0], splats, picture], size: [width, number],
+    });
+    return { steps, blended };
+  }
+
+  encode(encoder, steps) {
+    const pass = encoder.beginComputePass();
+    for (const step of steps) this.pipelines.encode(pass, step);
+    pass.end();
+  }
+}
+
+/// Columns and rows of tiles of a picture.
+export const tilesOf = ({ width, height }) => [Math.ceil(width / TILE), Math.ceil(height / TILE)];

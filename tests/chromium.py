@@ -1,0 +1,137 @@
+"""What the tests of the viewer's page in chromium share. Drawing is in software: no graphics device is needed."""
+
+import base64
+import math
+import os
+import shutil
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from pages import PATIENCE, READ_PIXELS, random_scene, turned_view
+
+from analytic_rasterizer import io
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-browser")
+
+WEBGL_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WEBGPU_FLAGS = (
+    *WEBGL_FLAGS,
+    "--enable-unsafe-webgpu",
+    "--enable-gpu",
+    "--ignore-gpu-blocklist",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+)
+"""With the first of them alone there is an adapter, but a canvas loses the device."""
+
+
+def find_browser():
+    """Path of a chromium, or None."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+
+
+@contextmanager
+def launch(flags):
+    """A chromium; skips where there is none."""
+    path = find_browser()
+    if path is None:
+        pytest.skip("needs chromium: make test-browser")
+    with playwright.sync_playwright() as runner:
+        launched = runner.chromium.launch(executable_path=path, args=list(flags), timeout=1000 * PATIENCE)
+        yield launched
+        launched.close()
+
+
+@contextmanager
+def open_page(browser, url, *, offline=False, init=None, **options):
+    """A page of its own context. Fails for anything that the page complains of in its console."""
+    context = browser.new_context(viewport={"width": 320, "height": 240}, offline=offline, **options)
+    context.set_default_timeout(1000 * PATIENCE)
+    page = context.new_page()
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.complaints = complaints
+    if init:
+        page.add_init_script(init)
+    page.goto(url)
+    yield page
+    context.close()
+    assert not page.complaints
+
+
+def wait_for(page, expression):
+    """Waits until the expression is true. The page's policy forbids to evaluate text in it, as playwright would."""
+    for _ in range(20 * PATIENCE):
+        value = page.evaluate(expression)
+        if value:
+            return value
+        page.wait_for_timeout(50)
+    raise AssertionError(f"{expression} did not become true; the page says: {page.inner_text('body')}")
+
+
+def wait_until_ready(page):
+    wait_for(page, "() => window.analyticReady || window.analyticError")
+    assert page.evaluate("() => window.analyticError ?? null") is None
+
+
+def pixels(page, width, height):
+    """The picture as float32 (3, height, width)."""
+    data = base64.b64decode(page.evaluate(READ_PIXELS))
+    return np.frombuffer(data, "<f4").reshape(3, height, width)
+
+
+def drawn(page, footprint, width, height, view=0):
+    page.evaluate("arguments => analyticRender(...arguments)", [view, footprint, width, height])
+    return pixels(page, width, height)
+
+
+def wait_for_frame(page):
+    """Waits until a frame is on the screen."""
+    wait_for(page, "() => document.getElementById('figures').textContent !== ''")
+
+
+def settle(page):
+    """The picture on the screen once it is what was asked for, as PNG."""
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
+    wait_for(page, "() => document.getElementById('surface').getAttribute('aria-busy') === 'false'")
+    return page.screenshot(type="png")
+
+
+# ------------------------------------------------------------------------------------- scenes
+
+
+def needles():
+    """Lines of 1 : 10000, in all directions."""
+    return random_scene(300).with_activated(scales=torch.tensor([0.5, 5e-5, 5e-5]).repeat(300, 1))
+
+
+def huge_and_near():
+    """Splats larger than the picture just behind the near plane, in front of a random scene."""
+    scene = random_scene(300)
+    near = torch.arange(8)
+    scene.means[near] = torch.tensor([0.0, 0.0, -0.15]) + 0.05 * torch.randn(8, 3, generator=torch.Generator())
+    scene.means[near, 2] = -0.15 + 0.02 * near  # the camera is at -0.4
+    scene.log_scales[near] = math.log(2.0)
+    scene.logit_opacities[near] = math.log(0.2 / 0.8)
+    return scene
+
+
+def equal_depths():
+    """Opaque splats in four planes that face the camera of `facing`: the order of the input decides."""
+    scene = random_scene(1200)
+    scene.means[:, 2] = 3 + scene.means[:, 2].floor() % 4
+    scene.logit_opacities[:] = math.log(0.9 / 0.1)
+    return scene
+
+
+def facing():
+    return io.View("facing", 160, 120, 150.0, 150.0, torch.eye(4, dtype=torch.float64))
+
+
+def off_centre():
+    return replace(turned_view(cx=101.5, cy=43.25), name="off centre")

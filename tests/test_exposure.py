@@ -1,0 +1,117 @@
+"""Colour corrections of photographs: what they are, and what they bring where exposure varies."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+import torch
+
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+
+from capture_files import circle, draw_picture, write_nerf_synthetic  # noqa: E402
+
+from analytic_rasterizer import cli, training  # noqa: E402
+from analytic_rasterizer.training import files  # noqa: E402
+from analytic_rasterizer.training.exposure import Exposures, best_exposure, corrected  # noqa: E402
+
+
+def test_gradients_of_a_correction():
+    shown = torch.rand(3, 5, 6, dtype=torch.float64, requires_grad=True)
+    exposure = torch.rand(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(corrected, (shown, exposure))
+    expected = torch.einsum("ij,jhw->ihw", exposure[:, :3], shown) + exposure[:, 3, None, None]
+    assert torch.allclose(corrected(shown, exposure), expected, rtol=1e-14)
+    assert corrected(shown, None) is shown
+
+
+def test_the_best_correction_is_found():
+    generator = torch.Generator().manual_seed(0)
+    shown = torch.rand(3, 20, 30, generator=generator)
+    exposure = torch.eye(3, 4) + 0.1 * torch.randn(3, 4, generator=generator)
+    target, mask = corrected(shown, exposure), torch.ones(20, 30)
+    assert torch.allclose(best_exposure(shown, target), exposure, atol=1e-5)
+    mask[:10] = 0
+    target[:, :10] = 9.0
+    assert torch.allclose(best_exposure(shown, target, mask), exposure, atol=1e-5)
+    flat = torch.full((3, 4, 4), 0.5)
+    assert torch.allclose(corrected(flat, best_exposure(flat, flat + 0.1)), flat + 0.1, atol=1e-5)
+
+
+def test_the_mean_stays_at_the_identity():
+    exposures = Exposures(4, torch.device("cpu"))
+    for step in range(20):
+        exposures.update({step % 4: torch.randn(3, 4, generator=torch.Generator().manual_seed(step))}, step / 20)
+    assert torch.allclose(exposures.matrices.mean(0), torch.eye(3, 4), atol=1e-6)
+    assert (exposures.matrices - torch.eye(3, 4)).abs().max() > 1e-3
+    again = Exposures(4, torch.device("cpu"))
+    again.load_state_dict(copy.deepcopy(exposures.state_dict()))
+    for each in (exposures, again):
+        each.update({1: torch.ones(3, 4)}, 0.5)
+    assert torch.equal(exposures.matrices, again.matrices)
+
+
+@pytest.fixture
+def uneven(tmp_path):
+    """NeRF-synthetic pictures of which the training's have gains of 0.7 to 1.3."""
+    folder = tmp_path / "uneven"
+    write_nerf_synthetic(folder, circle(12), circle(3))
+    for k, view in enumerate(circle(12)):
+        (path,) = folder.glob(f"train/{view.name}.png")
+        rgba = draw_picture(view, opaque=False).astype(np.float64)
+        rgba[..., :3] = (rgba[..., :3] * (0.7 + 0.6 * (5 * k % 12) / 11)).clip(0, 255)
+        image.fromarray(rgba.round().astype(np.uint8)).save(path)
+    return folder
+
+
+def run_of(folder, out, **options):
+    known = {"iterations": 200, "random_points": 300, "density": "none", "background": "black"}
+    run = training.Run(folder, out, training.TrainingOptions(**(known | options)))
+    run.train()
+    return run
+
+
+def test_the_op_makes_the_bits_of_autograd(uneven, tmp_path, monkeypatch):
+    made = []
+    for name, in_one_op in (("op", True), ("autograd", False)):
+        monkeypatch.setattr(training.trainer.Trainer, "_fits_one_op", lambda _, value=in_one_op: value)
+        run = run_of(uneven, tmp_path / name, iterations=40, exposure="affine")
+        made.append(((tmp_path / name / files.SCENE).read_bytes(), run.trainer.exposures.matrices))
+    assert made[0][0] == made[1][0] and torch.equal(made[0][1], made[1][1])
+
+
+def test_uneven_exposure_is_learned(uneven, tmp_path):
+    plain, affine = (run_of(uneven, tmp_path / name, exposure=name) for name in ("none", "affine"))
+    without, with_it = plain.evaluate()["test"]["mean"], affine.evaluate()["test"]["mean"]
+    assert "psnr_color_corrected" not in without
+    assert with_it["psnr_color_corrected"] > without["psnr"] + 0.3 and with_it["psnr"] > without["psnr"]
+    stored = json.loads((tmp_path / "affine" / files.EXPOSURES).read_text())
+    gains = [np.diag(np.array(matrix)[:, :3]).mean() for matrix in stored.values()]
+    given = [0.7 + 0.6 * (5 * k % 12) / 11 for k in range(12)]
+    assert np.corrcoef(gains, given)[0, 1] > 0.9
+    assert not (tmp_path / "none" / files.EXPOSURES).exists()
+
+
+def test_a_resumed_training_has_the_same_bits(uneven, tmp_path):
+    run_of(uneven, tmp_path / "whole", iterations=60, exposure="affine")
+    run = training.Run(uneven, tmp_path / "parts", training.TrainingOptions(
+        iterations=60, random_points=300, density="none", background="black", exposure="affine"
+    ))  # fmt: skip
+    for _ in range(25):
+        run.trainer.step()
+    run.save()
+    again = training.Run(uneven, tmp_path / "parts", resume=True)
+    again.train()
+    names = (files.SCENE, files.EXPOSURES)
+    assert all((tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes() for name in names)
+
+
+def test_the_command(uneven, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    given = ["train", str(uneven), "--out", out, "--iterations", "3", "--device", "cpu", "--exposure", "affine"]
+    assert cli.main(given) == 0
+    assert "after the best affine colour of each picture: PSNR" in capsys.readouterr().out
+    assert cli.main(["evaluate", out, "--lpips", "none", "--pictures", "0"]) == 0
+    assert "PSNR, best affine colour" in capsys.readouterr().out
+    assert cli.main([*given[:-1], "curve"]) == 2
+    assert "exposure" in capsys.readouterr().err

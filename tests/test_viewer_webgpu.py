@@ -1,0 +1,272 @@
+"""The viewer with WebGPU in a real browser: pictures against the CPU rasterizer, and what may go wrong with a device.
+
+Skipped where chromium or playwright is missing (`make test-browser` installs both), or chromium has no WebGPU in
+software.
+"""
+
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+from chromium import (
+    WEBGPU_FLAGS,
+    drawn,
+    equal_depths,
+    facing,
+    huge_and_near,
+    launch,
+    needles,
+    off_centre,
+    open_page,
+    pixels,
+    settle,
+    wait_for,
+    wait_for_frame,
+    wait_until_ready,
+)
+from pages import assert_same, random_scene, rendered, serve, turned_view
+
+import demo
+from analytic_rasterizer import viewer
+
+ADAPTER = "async () => (await navigator.gpu?.requestAdapter())?.info.isFallbackAdapter ?? null"
+DEVICES = """
+  window.devices = [];
+  const { requestDevice } = GPUAdapter.prototype;
+  GPUAdapter.prototype.requestDevice = async function (...given) {
+    window.devices.push(await requestDevice.apply(this, given));
+    return window.devices.at(-1);
+  };"""
+"""Runs before the page: keeps the devices that it asks for, which `destroy` of one takes away from it."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with launch(WEBGPU_FLAGS) as launched:
+        with serve(random_scene(10), [facing()]) as server, open_page(launched, server.url) as page:
+            adapter = page.evaluate(ADAPTER)
+        if adapter is None:
+            pytest.skip("needs a chromium that has WebGPU in software")
+        yield launched
+
+
+def open_gpu(browser, server, query="", **options):
+    """A page that draws with WebGPU although the device is only software."""
+    return open_page(browser, f"{server.url}?renderer=webgpu{query}", **options)
+
+
+def small(view, size=96):
+    return view.scaled(size / view.width)
+
+
+@pytest.fixture(scope="module")
+def settled(browser):
+    scene, view, background = random_scene(), small(turned_view()), (0.2, 0.3, 0.4)
+    with (
+        serve(scene, [view], background=background) as server,
+        open_gpu(browser, server, "&view=0&size=16x16") as page,
+    ):
+        wait_until_ready(page)
+        yield page, scene, view, background
+
+
+# ----------------------------------------------------------------------------------- pictures
+
+
+GATE = ("analytic", "moment:samples=4")
+
+
+@pytest.mark.parametrize(
+    "footprint",
+    [
+        pytest.param(name, marks=pytest.mark.gate if name in GATE else ())
+        for name in (*viewer.PAGE_FOOTPRINTS, "point:dilation=0.05", "mip:variance=0.3")
+    ],
+)
+def test_pictures(settled, footprint):
+    page, scene, view, background = settled
+    ours = drawn(page, footprint, view.width, view.height)
+    assert_same(ours, rendered(scene, view, footprint, background))
+    # Tiles at the border of a picture of another size are cut off.
+    other = view.scaled(1 / 3)
+    assert_same(drawn(page, footprint, other.width, other.height), rendered(scene, other, footprint, background))
+
+
+HARD = {
+    "demo": (lambda: demo.make_target()[0], lambda: demo.make_target()[1]),
+    "needles": (needles, turned_view),
+    "huge": (huge_and_near, turned_view),
+    "equal": (equal_depths, facing),
+    "off centre": (random_scene, off_centre),
+    "degree 0": (lambda: random_scene(degree=0), turned_view),
+    "degree 1": (lambda: random_scene(degree=1), turned_view),
+    "degree 2": (lambda: random_scene(degree=2), turned_view),
+    "one": (lambda: random_scene(count=1), facing),
+}
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_hard_scenes(browser, case):
+    make_scene, make_view = HARD[case]
+    scene, view = make_scene(), small(make_view())
+    with serve(scene, [view]) as server, open_gpu(browser, server, "&view=0&footprint=analytic") as page:
+        wait_until_ready(page)
+        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "analytic"))
+        ours = drawn(page, "moment:samples=4", view.width, view.height)
+        assert_same(ours, rendered(scene, view, "moment:samples=4"))
+        assert np.array_equal(ours, drawn(page, "moment:samples=4", view.width, view.height))
+
+
+def wide_splats():
+    """Faint Gaussians as large as the picture: more pairs of splat and tile than the page makes room for at first."""
+    scene = random_scene(500).with_activated(scales=torch.full((500, 3), 4.0))
+    scene.logit_opacities[:] = -4.0
+    return scene
+
+
+@pytest.mark.parametrize("most", [None, 4 * 70_000])
+def test_pairs_beyond_the_room_lose_no_picture(browser, most):
+    """The room grows; where the device has no more (`most` bytes of a binding), the picture is drawn in parts."""
+    scene, view = wide_splats(), small(facing(), 120)
+    init = f"""Object.defineProperty(
+      GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', {{ get: () => {most} }})"""
+    with serve(scene, [view]) as server, open_gpu(browser, server, "&view=0", init=init if most else None) as page:
+        wait_until_ready(page)
+        first = drawn(page, "box:samples=1", view.width, view.height)
+        assert_same(first, rendered(scene, view, "box:samples=1"))
+        assert np.array_equal(first, drawn(page, "box:samples=1", view.width, view.height))
+
+
+# ----------------------------------------------------------------------------- which renderer
+
+
+def test_a_scene_that_is_too_large_for_webgpu_is_drawn_without(browser):
+    init = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => 960 })"
+    with serve(random_scene(20), [facing()]) as server, open_gpu(browser, server, init=init) as page:
+        wait_for_frame(page)
+        expected = (
+            "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics "
+            "of degree 3. Footprints in grey need WebGPU."
+        )
+        assert page.text_content("#renderer") == expected
+
+
+def test_a_device_that_is_only_software_is_not_taken_unasked(browser):
+    with serve(random_scene(100), [facing()], footprint="moment") as server, open_page(browser, server.url) as page:
+        wait_for_frame(page)
+        assert page.text_content("#renderer").startswith("WebGL 2 draws: WebGPU would have no graphics device here.")
+        assert page.text_content("#note") == "moment:samples=4, drawn as box:samples=1"
+    with serve(random_scene(100), [facing()]) as server, open_gpu(browser, server) as page:
+        wait_for_frame(page)
+        assert page.text_content("#renderer") == "WebGPU draws."
+
+
+@pytest.mark.gate
+def test_a_lost_device_comes_back_once_and_then_webgl_draws(browser):
+    scene, view = random_scene(500), facing()
+    lose = "() => { const lost = devices.at(-1); lost.destroy(); return lost.lost.then(() => null); }"
+    with serve(scene, [view], footprint="moment") as server, open_gpu(browser, server, init=DEVICES) as page:
+        wait_for_frame(page)
+        before = drawn(page, "moment:samples=4", view.width, view.height)
+        assert_same(before, rendered(scene, view, "moment:samples=4"))
+        page.evaluate(lose)
+        assert np.array_equal(drawn(page, "moment:samples=4", view.width, view.height), before)
+        assert page.evaluate("() => devices.length") == 2
+        page.evaluate(lose)
+        wait_for(page, "() => document.getElementById('renderer').textContent.startsWith('WebGL 2 draws: ')")
+        assert "WebGPU lost the graphics device twice." in page.text_content("#renderer")
+        assert_same(drawn(page, "analytic", view.width, view.height), rendered(scene, view, "analytic"))
+        assert page.is_hidden("#message")
+
+
+def test_where_webgpu_fails_webgl_draws(browser):
+    init = """
+      GPUDevice.prototype.createComputePipelineAsync = async () => { throw new Error('A shader is refused.'); };"""
+    with serve(random_scene(100), [facing()]) as server, open_gpu(browser, server, init=init) as page:
+        wait_for_frame(page)
+        expected = "WebGL 2 draws: WebGPU failed here. A shader is refused. Footprints in grey need WebGPU."
+        assert page.text_content("#renderer") == expected
+        assert page.is_hidden("#message")
+
+
+def test_a_picture_whose_device_is_lost_is_drawn_again(browser):
+    scene, view = random_scene(500), turned_view()
+    query = "&view=0&size=16x16"
+    with serve(scene, [view]) as server, open_gpu(browser, server, query, init=DEVICES) as page:
+        wait_until_ready(page)
+        page.evaluate(
+            """async given => {
+              const drawn = analyticRender(...given);
+              devices[0].destroy();  // while the device is at work
+              await drawn;
+            }""",
+            [0, "moment:samples=4", view.width, view.height],
+        )
+        assert page.evaluate("() => devices.length") == 2
+        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "moment:samples=4"))
+
+
+# ----------------------------------------------------------------------------------- the page
+
+
+@pytest.mark.gate
+def test_an_exported_file_draws_moment_without_network(browser, tmp_path):
+    scene, view = random_scene(500), facing()
+    path = tmp_path / "scene.html"
+    viewer.export_page(path, viewer.pack_scene(scene, [view], footprint="moment"))
+    with open_page(browser, f"{path.as_uri()}?view=0&renderer=webgpu", offline=True) as page:
+        wait_until_ready(page)
+        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "moment:samples=4"))
+
+
+@pytest.fixture
+def controls(browser):
+    """A page for a user who prefers no motion, so that journeys end at once."""
+    scene, views = random_scene(300), [facing(), turned_view()]
+    with (
+        serve(scene, views, name="room.ply", footprint="moment") as server,
+        open_gpu(browser, server, reduced_motion="reduce") as page,
+    ):
+        wait_for_frame(page)
+        yield page
+
+
+def test_the_divider_and_the_heat_map_compare_any_two(controls):
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+
+    def picture():
+        return np.asarray(image.open(BytesIO(settle(controls))).convert("RGB"))[50:100]  # without names and controls
+
+    controls.keyboard.press("h")
+    moment = picture()
+    controls.keyboard.press("c")
+    assert controls.text_content("#label-right") == "point"
+    both = picture()
+    controls.keyboard.press("c")
+    difference = picture()
+    controls.keyboard.press("c")
+    controls.keyboard.press("1")
+    point = picture()
+    assert (both[:, :120] == moment[:, :120]).all() and (both[:, 200:] == point[:, 200:]).all()
+    assert (moment[:, :120] != point[:, :120]).any() and (moment[:, 200:] != point[:, 200:]).any()
+    darkest = difference[(point == moment).all(axis=2)]
+    assert len(darkest) > 0 and darkest.max() <= 32  # the first colour of the map
+    assert difference.max() > 100
+
+
+def test_what_the_screen_shows_is_the_picture(browser):
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+    view = replace(facing(), width=320, height=240, fx=300.0, fy=300.0)
+    scene = random_scene(500)
+    expected = rendered(scene, view, "moment:samples=4").clip(0, 1).transpose(1, 2, 0)
+    with serve(scene, [view], footprint="moment") as server, open_gpu(browser, server) as page:
+        wait_for_frame(page)
+        page.keyboard.press("h")
+        shown = np.asarray(image.open(BytesIO(settle(page))).convert("RGB"))
+        assert np.abs(shown - 255 * expected)[50:100].max() <= 1.5
+        with page.expect_download() as download:
+            page.keyboard.press("p")
+        saved = np.asarray(image.open(download.value.path()).convert("RGB"))
+        assert saved.shape == shown.shape and (saved[50:100] == shown[50:100]).all()
