@@ -88,6 +88,8 @@ def evaluate(
         footprint: To render with.
         lpips: From `load_lpips`; None: left out.
         supersampling: As in `TrainingOptions`.
+        color_corrected: Also measure "psnr_color_corrected", after the affine map of colours that is best for each
+            picture, by least squares.
         ranks: Those that share the scene and the views. All of them get all results.
         **options: Further settings.
 

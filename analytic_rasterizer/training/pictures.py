@@ -93,7 +93,7 @@ class Pictures(NamedTuple):
         return self._color(scale, view) if background is None else self.truth(scale, view, background)
 
     def mask(self, scale: int, view: int) -> Tensor | None:
-        """(H, W) float32 on the device: the share of each pixel that counts. None: all of them count."""
+        """(H, W) float32 on the device: the share of each pixel of a `view` at a `scale` that counts. None: all do."""
         stored = self.masks[scale][view]
         return None if stored is None else self._on_device(stored, scale, view).float() / 255
 
