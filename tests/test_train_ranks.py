@@ -137,7 +137,7 @@ def gradients(scene, folder, ranks):
     run = make_run(scene, folder / "gradients", ranks)
     trainer = run.trainer
     trainer._set_rates()
-    loss, seen, _ = trainer._loss()
+    loss, seen, *_ = trainer._loss()
     loss.backward()
     made = {name: ranks.gather_rows(field.grad) for name, field in trainer.gaussians._asdict().items()}
     trainer._observe(seen)

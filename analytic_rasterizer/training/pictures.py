@@ -72,13 +72,14 @@ class Pictures(NamedTuple):
         settings: By scale, for every view.
         colors: By scale, for every view: (3, H, W) uint8, on the background; or (4, H, W) premultiplied, with alpha.
             Black where nothing counts; otherwise the mean of what counts.
-        masks: By scale, for every view: (H, W) uint8, the share of each pixel that counts; None: all of them count.
+        masks: By scale, for every view: (H, W) uint8, the share of each pixel that counts; None: all of them count,
+            in all views if it stands for the dict.
     """
 
     views: list[io.View]
     settings: dict[int, list[GaussianRasterizationSettings]]  # made once: they hold tensors
     colors: dict[int, list[Tensor]]
-    masks: dict[int, list[Tensor | None]]
+    masks: dict[int, list[Tensor | None]] | None = None
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
         """The picture of a `view` at a `scale`, (3, H, W) float32 in [0, 1] on the device.
@@ -94,7 +95,7 @@ class Pictures(NamedTuple):
 
     def mask(self, scale: int, view: int) -> Tensor | None:
         """(H, W) float32 on the device: the share of each pixel of a `view` at a `scale` that counts. None: all do."""
-        stored = self.masks[scale][view]
+        stored = None if self.masks is None else self.masks[scale][view]
         return None if stored is None else self._on_device(stored, scale, view).float() / 255
 
     def _on_device(self, stored: Tensor, scale: int, view: int) -> Tensor:
