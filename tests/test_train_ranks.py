@@ -295,7 +295,7 @@ def test_gradients_are_those_of_one_process(made):
     """A sum over two cameras has one rounding, whatever its order; the rest is the same arithmetic."""
     got = torch.load(made / "gradients.pt")
     one = sharded_alone(made)
-    loss, seen, _ = one._loss()
+    loss, seen, *_ = one._loss()
     loss.backward()
     # A rounding for each part of the sum, and one for each part's division.
     assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
@@ -331,7 +331,7 @@ def test_a_sparse_step_updates_what_a_picture_of_any_rank_shows(made):
     one = sharded_alone(made, sparse_adam=True)
     scatter(one.gaussians)
     shown, optimizer = rows_shown(one), optimizer_of_two(one)
-    loss, _, rows = one._loss()
+    loss, _, rows, _ = one._loss()
     assert torch.equal(rows, shown[0] | shown[1]) and not torch.equal(*shown) and 0 < rows.sum() < len(rows)
     loss.backward()
     optimizer.step(rows=rows)
