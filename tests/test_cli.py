@@ -236,7 +236,7 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
         (["tables", "360-stst", "--data", "{}"], "tables 360-stst needs --out DIR"),
         (["tables", "360-stst"], "tables 360-stst needs --data FOLDER and --out DIR"),
         (
-            ["view", "a.ply", "--footprint", "moment"],
+            ["view", "a.ply", "--footprint", "exact"],
             "; with --server every footprint can be shown",
         ),
         (["view", "a.ply", "--export", ""], "--export must end in .html, got"),

@@ -57,7 +57,7 @@ BY_NAME = {model.name: model for model in MODELS}
 
 CAMERAS, IMAGES, POINTS = "cameras", "images", "points3D"
 SUFFIXES = (".bin", ".txt")
-OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
+OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point3D", "<u8")])
 
 
 class Registered(NamedTuple):
@@ -217,7 +217,7 @@ def _binary_images(path: Path) -> Iterator[tuple]:
         file_name = records.text()
         (count,) = records.take("Q")
         observations = np.frombuffer(records.data, OBSERVATION, count, records.skip(OBSERVATION.itemsize * count))
-        yield file_name, pose, camera, observations["point"]
+        yield file_name, pose, camera, observations["point3D"]
 
 
 def _binary_points(path: Path) -> Iterator[list[float]]:

@@ -29,7 +29,7 @@ from .frames import (
     take_snapshot,
 )
 from .guarded import start_viser
-from .packing import extent, mean_up, overview
+from .packing import extent, mean_up, overview, upright
 
 REST_AFTER = 0.2
 """Seconds without motion after which a camera rests."""
@@ -123,7 +123,8 @@ class LiveViewer:
 
         self.name = name
         self.interval = interval
-        self.views = views or [overview(torch.zeros(3, dtype=torch.float64, device="cpu"), 1.0)]
+        _, down, ahead = torch.eye(3, dtype=torch.float64, device="cpu")
+        self.views = views or [overview(0 * down, 1.0, -down, ahead, 0.0)]  # until there is a scene
         self._views_given = bool(views)
         self._middle = torch.zeros(3, dtype=torch.float64, device="cpu")  # of the first scene, which cameras turn about
         self._radius = 1.0
@@ -237,7 +238,8 @@ class LiveViewer:
         middle, self._radius = extent(scene)
         self._middle = middle.cpu()
         if not self._views_given:
-            self.views = [overview(self._middle, self._radius)]
+            self.views = [overview(self._middle, self._radius, *upright(scene.to("cpu"), self._middle, self._radius))]
+            self._server.scene.set_up_direction(tuple(mean_up(self.views)))
 
     def _connect(self, handle) -> None:
         client = _Client(handle, self)
