@@ -172,8 +172,8 @@ class Lens:
             longitude, latitude = positions.unbind(1)
             across = torch.where(latitude.abs() <= math.pi / 2, latitude.cos(), math.nan)
             return torch.stack([across * longitude.sin(), latitude.sin() + 0 * across, across * longitude.cos()], 1)
-        # The unknown is the angle from the axis times the unit vector across it. `start` has the angle that the lens
-        # shows at this distance along x.
+        # The unknown is the angle from the axis times the unit vector across it. The first guess is the angle that the
+        # lens shows at this distance along x.
         angles = torch.linspace(0, self.fold, 8 * _ANGLES, dtype=torch.float64)
         shown = self.project(torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], 1))[0]
         shown = shown.norm(dim=1).nan_to_num(math.inf).cummax(0).values

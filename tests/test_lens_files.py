@@ -269,3 +269,20 @@ def test_training_with_lenses(tmp_path, lens):
     before = run.evaluate()["test"]["mean"]["psnr"]
     run.train()
     assert run.evaluate()["test"]["mean"]["psnr"] > before + 3
+
+
+@pytest.mark.parametrize("lens", [*LENSES, ar.Lens.equirectangular()])
+def test_random_points_are_in_the_pictures_of_lenses(lens):
+    placement = pytest.importorskip("analytic_rasterizer.training.placement", reason="needs the train extra")
+    from capture_files import circle
+
+    sphere = {"width": 64, "height": 32, "fx": 64 / (2 * math.pi), "fy": 32 / math.pi}
+    changed = sphere if lens is not None and lens.model == "equirectangular" else {"fx": 30.0, "fy": 30.0}
+    views = [replace(view, lens=lens, **changed) for view in circle(6, (64, 48))]
+    points, _ = placement.points_in_view(views, 300, seed=0)
+    assert points.isfinite().all()
+    shown = torch.zeros(300, dtype=torch.bool)
+    for view in views:
+        pixels = view.pixels_of(points.double() @ view.w2c[:3, :3].T + view.w2c[:3, 3])
+        shown |= ((pixels >= -0.01) & (pixels <= torch.tensor([view.width, view.height]) + 0.01)).all(1)
+    assert shown.all()

@@ -13,7 +13,7 @@ from .. import _C
 from ..camera import is_orthographic
 from ..effects import NEAR, Effects
 from ..gaussians import Gaussians
-from ..lens import WIDE, Lens
+from ..lens import Lens
 from ..rotations import product, rotation_matrices
 from ..settings import GaussianRasterizationSettings
 
@@ -89,6 +89,6 @@ def _slopes(lens: Lens, focal: torch.Tensor, near: float, points: torch.Tensor) 
     """(P, 2, 3) px by world units, the derivative at points (P, 3) in camera space, and (P,) whether they are seen."""
     coefficients = list(lens.numbers())
     slopes = _C.lens_points(lens.model, coefficients, points)[1]
-    depth = points.norm(dim=1) if lens.model in WIDE else points[:, 2]
+    depth = points.norm(dim=1) if lens.orders_by_distance else points[:, 2]
     angle = torch.atan2(torch.hypot(points[:, 0], points[:, 1]), points[:, 2])
     return focal[:, None] * slopes, (depth > near) & (angle <= lens.fold)
