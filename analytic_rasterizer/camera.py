@@ -319,6 +319,10 @@ class View:
             return torch.nn.functional.normalize(torch.cat([positions, torch.ones_like(positions[:, :1])], 1), dim=1)
         return self.lens.unproject(positions).to(pixels.device)
 
+    def depths_of(self, points: torch.Tensor) -> torch.Tensor:
+        """(N,) depths of points (N, 3) in the camera's frame: z, or with some lenses the distance from the camera."""
+        return points[:, 2] if self.lens is None else self.lens.depths(points)
+
     def in_frame(self, offset: tuple[float, float, float] | None) -> View:
         """The same camera with positions relative to another offset, as those of a scene with this offset are."""
         zero = (0.0, 0.0, 0.0)

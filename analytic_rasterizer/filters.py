@@ -126,7 +126,7 @@ def _interval_of_lens(means3D: torch.Tensor, camera: Any, effects: Effects) -> t
     middle = view_center(camera.viewmatrix, camera.projmatrix, with_gradient=False).to(positions)
     tangents = positions.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
     inside = ((positions - middle).abs() <= (1 + 2 * MARGIN) * tangents).all(1)
-    depth = points.norm(dim=1) if effects.lens.orders_by_distance else points[:, 2]
+    depth = effects.lens.depths(points)
     inside &= (depth > effects.near) & (depth < effects.far)
     focal = max(camera.image_width / (2 * float(camera.tanfovx)), camera.image_height / (2 * float(camera.tanfovy)))
     rows = derivatives @ view[:3, :3].T

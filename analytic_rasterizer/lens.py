@@ -136,6 +136,10 @@ class Lens:
         """Whether depths are distances from the camera, and not camera-space z."""
         return self.model in (*WIDE, SPHERE)
 
+    def depths(self, points: torch.Tensor) -> torch.Tensor:
+        """(N,) depths, as of `Effects.lens`, of points (N, 3) in the camera's frame, world units."""
+        return points.norm(dim=1) if self.orders_by_distance else points[:, 2]
+
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where the lens shows points, in units of the focal lengths, from the principal point. Waits for a device.
 

@@ -41,8 +41,8 @@ class GsplatCase(Case):
         super().__init__(scene, view, self.like)
         self.rasterization = importlib.import_module("gsplat").rasterization
         del self.inputs["means2D"]  # its function has no such argument
-        middle = (view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy)
-        intrinsics = [[view.fx, 0.0, middle[0]], [0.0, view.fy, middle[1]], [0.0, 0.0, 1.0]]
+        cx, cy = view.middle
+        intrinsics = [[view.fx, 0.0, cx], [0.0, view.fy, cy], [0.0, 0.0, 1.0]]
         self.fixed = {
             "viewmats": view.w2c.to(scene.means)[None],
             "Ks": torch.tensor(intrinsics).to(scene.means)[None],

@@ -210,7 +210,7 @@ def prepare(args: argparse.Namespace) -> Job:
     def resized(view: io.View, size: str) -> io.View:
         width, height = parse_size(size)
         x, y = width / view.width, height / view.height
-        cx, cy = (view.width / 2 if view.cx is None else view.cx), (view.height / 2 if view.cy is None else view.cy)
+        cx, cy = view.middle
         return replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=x * cx, cy=y * cy)
 
     def camera(view: io.View) -> Camera:

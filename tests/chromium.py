@@ -135,3 +135,16 @@ def facing():
 
 def off_centre():
     return replace(turned_view(cx=101.5, cy=43.25), name="off centre")
+
+
+HARD = {
+    "needles": (needles, turned_view),
+    "huge": (huge_and_near, turned_view),
+    "equal": (equal_depths, facing),
+    "off centre": (random_scene, off_centre),
+    "degree 0": (lambda: random_scene(degree=0), turned_view),
+    "degree 1": (lambda: random_scene(degree=1), turned_view),
+    "degree 2": (lambda: random_scene(degree=2), turned_view),
+    "one": (lambda: random_scene(count=1), facing),
+}
+"""Scenes that are hard to draw, and views of them."""

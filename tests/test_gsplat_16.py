@@ -10,9 +10,7 @@ from conftest import each_precision, run_python
 from reference import spherical_harmonics
 from test_gsplat import (
     BOTH_LAYOUTS,
-    FAR,
     HEIGHT,
-    NEAR,
     WIDTH,
     assert_gradients_close,
     cameras_of,
@@ -20,6 +18,7 @@ from test_gsplat import (
     drop_in,
     gradients,
     patched,  # noqa: F401  (a fixture)
+    projected,
     reference,  # noqa: F401  (a fixture)
     render,
     scene_of,
@@ -192,28 +191,15 @@ def test_a_lens_is_that_of_the_formulas(device, dtype, packed, name, by_z):
 def test_a_fisheye_is_that_of_gsplats_reference(reference, mode):  # noqa: F811
     """Without coefficients, where gsplat does not clamp and neither does this inside the image."""
     scene, cameras = scene_of(torch.float64, "cpu", count=200), cameras_of(torch.float64, "cpu")
-    covars, _ = reference._quat_scale_to_covar_preci(scene["quats"], scene["scales"], True, False)
-    _, means2d, depths, conics, amplitudes = reference._fully_fused_projection(
-        scene["means"],
-        covars,
-        cameras["viewmats"],
-        cameras["Ks"],
-        WIDTH,
-        HEIGHT,
-        near_plane=NEAR,
-        far_plane=FAR,
-        calc_compensations=mode == "antialiased",
-        camera_model="fisheye",
-    )
+    expected = projected(reference, scene, cameras, mode, "fisheye")
     _, _, meta = render(scene, cameras, packed=False, camera_model="fisheye", rasterize_mode=mode)
     size = torch.tensor([WIDTH, HEIGHT])
+    means2d = expected["means2d"]
     drawn = (meta["radii"] > 0).all(-1) & ((means2d > 0) & (means2d < size)).all(-1)
     assert drawn.sum() > 200
-    opacities = scene["opacities"] * (1 if amplitudes is None else amplitudes)
     # The reference adds 1e-7 to lengths and to z.
-    for key, expected in (("means2d", means2d), ("depths", depths), ("conics", conics), ("opacities", opacities)):
-        expected = expected.expand(meta[key].shape)
-        torch.testing.assert_close(meta[key][drawn], expected[drawn], rtol=1e-4, atol=1e-5)
+    for key in ("means2d", "depths", "conics", "opacities"):
+        torch.testing.assert_close(meta[key][drawn], expected[key][drawn], rtol=1e-4, atol=1e-5)
 
 
 @each_precision

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 import torch
 from chromium import (
+    HARD,
     WEBGL_FLAGS,
     drawn,
-    equal_depths,
     facing,
-    huge_and_near,
     launch,
-    needles,
     off_centre,
     open_page,
     pixels,
@@ -92,18 +90,6 @@ def test_random_scene(random_page, footprint, reduction):
     view = view.scaled(1 / reduction)
     ours = drawn(page, footprint, view.width, view.height)
     assert_same(ours, rendered(scene, view, footprint))
-
-
-HARD = {
-    "needles": (needles, turned_view),
-    "huge": (huge_and_near, turned_view),
-    "equal": (equal_depths, facing),
-    "off centre": (random_scene, off_centre),
-    "degree 0": (lambda: random_scene(degree=0), turned_view),
-    "degree 1": (lambda: random_scene(degree=1), turned_view),
-    "degree 2": (lambda: random_scene(degree=2), turned_view),
-    "one": (lambda: random_scene(count=1), facing),
-}
 
 
 @pytest.mark.parametrize("case", HARD)

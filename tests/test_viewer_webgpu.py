@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 import torch
 from chromium import (
+    HARD,
     WEBGPU_FLAGS,
     drawn,
-    equal_depths,
     facing,
-    huge_and_near,
     launch,
-    needles,
-    off_centre,
     open_page,
     pixels,
     settle,
@@ -94,22 +91,12 @@ def test_pictures(settled, footprint):
     assert_same(drawn(page, footprint, other.width, other.height), rendered(scene, other, footprint, background))
 
 
-HARD = {
-    "demo": (lambda: demo.make_target()[0], lambda: demo.make_target()[1]),
-    "needles": (needles, turned_view),
-    "huge": (huge_and_near, turned_view),
-    "equal": (equal_depths, facing),
-    "off centre": (random_scene, off_centre),
-    "degree 0": (lambda: random_scene(degree=0), turned_view),
-    "degree 1": (lambda: random_scene(degree=1), turned_view),
-    "degree 2": (lambda: random_scene(degree=2), turned_view),
-    "one": (lambda: random_scene(count=1), facing),
-}
+HARD_AND_DEMO = HARD | {"demo": (lambda: demo.make_target()[0], lambda: demo.make_target()[1])}
 
 
-@pytest.mark.parametrize("case", HARD)
+@pytest.mark.parametrize("case", HARD_AND_DEMO)
 def test_hard_scenes(browser, case):
-    make_scene, make_view = HARD[case]
+    make_scene, make_view = HARD_AND_DEMO[case]
     scene, view = make_scene(), small(make_view())
     with serve(scene, [view]) as server, open_gpu(browser, server, "&view=0&footprint=analytic") as page:
         wait_until_ready(page)

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import torch
 
-from .. import _C
 from ..camera import is_orthographic
 from ..effects import NEAR, Effects
+from ..filters import PIXEL_VARIANCE
 from ..gaussians import Gaussians
 from ..lens import Lens
 from ..rotations import product, rotation_matrices
 from ..settings import GaussianRasterizationSettings
 
 LIMIT = 0.3  # of `affine_error`: there a weight is off by 0.1 to 0.3 at most
-PIXEL_VARIANCE = 1 / 12  # px^2, of a pixel's own width
 _ROWS = 2**18  # that are computed at a time
 
 
@@ -87,8 +86,5 @@ def _errors(lens: Lens, focal: torch.Tensor, near: float, centres: torch.Tensor,
 
 def _slopes(lens: Lens, focal: torch.Tensor, near: float, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """(P, 2, 3) px by world units, the derivative at points (P, 3) in camera space, and (P,) whether they are seen."""
-    coefficients = list(lens.numbers())
-    slopes = _C.lens_points(lens.model, coefficients, points)[1]
-    depth = points.norm(dim=1) if lens.orders_by_distance else points[:, 2]
-    angle = torch.atan2(torch.hypot(points[:, 0], points[:, 1]), points[:, 2])
-    return focal[:, None] * slopes, (depth > near) & (angle <= lens.fold)
+    positions, slopes = lens.project(points)
+    return focal[:, None] * slopes, (lens.depths(points) > near) & ~positions.isnan().any(1)

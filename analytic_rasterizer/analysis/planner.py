@@ -314,7 +314,7 @@ def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], n
     view = names[shares.index(largest)]
     reason = (
         f"the map of the camera bends over {percent(largest)} of the Gaussians that {view} shows (affine_error "
-        f" above {LIMIT}, docs/accuracy.md), which a splat cannot show"
+        f"above {LIMIT}, docs/accuracy.md), which a splat cannot show"
     )
     advice = "pictures of narrower views" if needed else "as it is"
     return Finding("affine picture", needed, None, None, None, advice, reason)

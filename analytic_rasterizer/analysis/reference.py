@@ -44,8 +44,7 @@ def supersampled(
         divisors = [n for n in range(1, density + 1) if density % n == 0]
         fine = max((n for n in divisors if n * n * view.width * view.height <= MAX_PIXELS), default=1)
     shifts = density // fine
-    cx = view.width / 2 if view.cx is None else view.cx
-    cy = view.height / 2 if view.cy is None else view.cy
+    cx, cy = view.middle
     total = torch.zeros(3, view.height, view.width, dtype=torch.float64, device=scene.means.device)
     for i in range(shifts**2):
         column, row = ((n + 0.5) / shifts - 0.5 for n in (i % shifts, i // shifts))

@@ -287,20 +287,24 @@ def _undistorted(items: list[Photograph]) -> list[Photograph]:
     return [item._replace(undistort=item.view.lens is not None) for item in items]
 
 
+def lens_models(items: list[Photograph]) -> str:
+    """The models of the lenses that photographs have, in words."""
+    return ", ".join(sorted({item.view.lens.model for item in items if item.view.lens is not None}))
+
+
 def _about_lenses(distorted: list[Photograph], number: int) -> str:
     """Which photographs have a lens, in a sentence."""
-    models = ", ".join(sorted({item.view.lens.model for item in distorted}))
-    return f"{len(distorted)} of {number} photographs have a lens ({models}), with which they are rendered"
+    which = f"{len(distorted)} of {number} photographs have a lens ({lens_models(distorted)})"
+    return f"{which}, with which they are rendered"
 
 
 def _about_lost_area(distorted: list[Photograph], number: int) -> str:
     """What is done with photographs that are undistorted, in a sentence."""
     lost = [1 - window_of(item.view).kept for item in distorted]
     low, high = (f"{100 * share:.1f}" for share in (min(lost), max(lost)))
-    models = ", ".join(sorted({item.view.lens.model for item in distorted}))
     return (
-        f"{len(distorted)} of {number} photographs ({models}) are resampled to pinholes, for tests too, and lose "
-        f"{low if low == high else f'{low} to {high}'}% of their area at the border (--lens undistort)"
+        f"{len(distorted)} of {number} photographs ({lens_models(distorted)}) are resampled to pinholes, for tests "
+        f"too, and lose {low if low == high else f'{low} to {high}'}% of their area at the border (--lens undistort)"
     )
 
 

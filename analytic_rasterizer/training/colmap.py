@@ -155,6 +155,7 @@ def load_tracks(folder: Path) -> dict[str, Tensor]:
     ascending = identifiers[order]
     observed = {}
     for file_name, _, _, observations in _images(folder):
+        observations = observations.split()[2::3] if isinstance(observations, str) else observations
         wanted = np.unique(_whole(f"{folder}/images", observations))
         place = np.searchsorted(ascending, wanted)
         place[place == len(ascending)] = 0
@@ -317,9 +318,9 @@ def _text_images(path: Path) -> Iterator[tuple]:
         if len(words) != 10:
             raise io.SceneError(f"{path}: cut short")
         # The observations of a picture are in a second line, which may be empty, and which some programs leave out.
-        observed = []
+        observed = ""
         if at < len(lines) and not _is_picture(lines[at]):
-            observed = lines[at].split()[2::3] if _is_content(lines[at]) else []
+            observed = lines[at] if _is_content(lines[at]) else ""
             at += 1
         yield words[9].strip(), _floats(path, words[1:8]), words[8], observed
 

@@ -144,8 +144,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
     pixels = view.pixels_of(in_camera)
     inside = ((pixels >= 0) & (pixels < pixels.new_tensor([width, height]))).all(1)
-    wide = view.lens is not None and view.lens.orders_by_distance
-    depth = in_camera.norm(dim=1) if wide else in_camera[:, 2]
+    depth = view.depths_of(in_camera)
     visible = inside.nonzero()[:, 0]
     visible = visible[_in_front(pixels[visible], depth[visible], width, height) & chosen[visible]]
     observed = visible

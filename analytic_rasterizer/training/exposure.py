@@ -28,15 +28,15 @@ class Exposures:
         self.identity = torch.eye(3, 4, dtype=torch.float32, device=device)
         self.matrices = self.identity.repeat(count, 1, 1)
         self.optimizer = TrainingAdam([self.matrices])
-        self._rows = torch.eye(count, dtype=torch.bool, device=device)
 
     def update(self, gradients: dict[int, Tensor], share: float) -> None:
         """Takes a step with gradients (3, 4) of some photographs, when `share` of the training is over."""
         self.optimizer.param_groups[0]["lr"] = RATE * (RATE_END / RATE) ** min(max(share, 0.0), 1.0)
-        grad, rows = torch.zeros_like(self.matrices), torch.zeros_like(self._rows[0])
+        grad = torch.zeros_like(self.matrices)
+        rows = torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
         for view, gradient in gradients.items():
             grad[view] += gradient
-            rows = rows | self._rows[view]
+            rows[view] = True
         self.matrices.grad = grad
         self.optimizer.update(rows)
         self.matrices.grad = None

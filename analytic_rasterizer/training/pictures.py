@@ -119,8 +119,8 @@ def load_pictures(
 ) -> Pictures:
     """Reads photographs and reduces them.
 
-    A picture that is to be undistorted is resampled to that of a pinhole, see `lenses.without_lens`. All pictures are
-    cut about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
+    A picture that is to be undistorted is resampled to that of a pinhole, see `undistortion.without_lens`. All pictures
+    are cut about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
 
     Args:
         items: What `load_capture` found.
@@ -278,8 +278,7 @@ def fitted(
             f"{path}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x {height}"
         )
     x, y = width / view.width, height / view.height
-    cx = x * (view.width / 2 if view.cx is None else view.cx)
-    cy = y * (view.height / 2 if view.cy is None else view.cy)
+    cx, cy = (factor * middle for factor, middle in zip((x, y), view.middle))
     view = replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=cx, cy=cy)
     rgba, mask = _with_alpha_as_mask(rgba, mask) if item.alpha_is_mask else (rgba, mask)
     if item.undistort:

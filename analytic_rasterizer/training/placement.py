@@ -55,13 +55,11 @@ def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor,
     chosen = torch.randint(len(views), (count,), generator=generator, device="cpu")
     z = depth * NEAREST_DEPTH * (FARTHEST_DEPTH / NEAREST_DEPTH) ** uniform[:, 2]
     size = torch.tensor([(v.width, v.height) for v in views], dtype=torch.float64, device="cpu")[chosen]
-    pixels, rays = uniform[:, :2] * size, torch.empty_like(uniform)
+    pixels, positions = uniform[:, :2] * size, torch.empty_like(uniform)
     for i in chosen.unique().tolist():
         of_view = chosen == i
-        rays[of_view] = views[i].rays_of(pixels[of_view])
-    # Depths are z, of wide lenses distances.
-    wide = torch.tensor([v.lens is not None and v.lens.orders_by_distance for v in views])[chosen]
-    positions = rays * (z / torch.where(wide, 1.0, rays[:, 2]))[:, None]
+        rays = views[i].rays_of(pixels[of_view])
+        positions[of_view] = rays * (z[of_view] / views[i].depths_of(rays))[:, None]
     # Where a lens shows nothing, a point is ahead.
     positions = torch.where(positions.isfinite(), positions, torch.stack([0 * z, 0 * z, z], 1))
     in_camera = torch.cat([positions, torch.ones_like(z[:, None])], 1)

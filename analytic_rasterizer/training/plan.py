@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 
 from .. import io
 from . import colmap
-from .captures import IMAGES, check_capture, read_cameras
+from .captures import IMAGES, check_capture, lens_models, read_cameras
 from .evidence import (
     LARGEST,
     LEAST_SEEN,
@@ -160,8 +160,7 @@ def plan_capture(
     findings = (
         _lens(items),
         *_colors(evidence, bool(tracks)),
-        _intervals(evidence),
-        _scales(evidence, kept),
+        *_intervals(evidence, kept),
         _blur(evidence, looked_at),
         _masks(capture, items),
         _alpha(evidence, looked_at),
@@ -198,9 +197,7 @@ def displacement_of(view: io.View) -> float:
     rays, pixels = rays[shown], pixels[shown]
     if (rays[:, 2] <= 0).any():
         return math.inf
-    moved = pixels - io.View(
-        "pinhole", view.width, view.height, view.fx, view.fy, view.w2c, view.cx, view.cy
-    ).pixels_of(rays)
+    moved = pixels - replace(view, lens=None).pixels_of(rays)
     return moved.norm(dim=1).max().item() if len(rays) else 0.0
 
 
@@ -210,8 +207,7 @@ def _lens(items: list[Photograph]) -> Finding:
         return Finding("lens", 0.0, "px", NO, "", "from a pinhole: no camera has a lens")
     distinct = {(v.lens, v.width, v.height, v.fx, v.fy, v.middle): v for v in (item.view for item in with_lens)}
     largest = max(displacement_of(view) for view in spread_out(list(distinct.values()), MOST_PHOTOGRAPHS))
-    models = ", ".join(sorted({item.view.lens.model for item in with_lens}))
-    which = f"{len(with_lens)} of {len(items)} photographs have a lens ({models})"
+    which = f"{len(with_lens)} of {len(items)} photographs have a lens ({lens_models(with_lens)})"
     if math.isinf(largest):
         reason = f"{which}, and show more than a half space, which no pinhole does"
         return Finding("lens", None, "px", YES, "--lens keep", reason)
@@ -220,31 +216,26 @@ def _lens(items: list[Photograph]) -> Finding:
     return Finding("lens", largest, "px", YES if needed else NO, "--lens keep" if needed else "", reason)
 
 
-def _intervals(evidence: Evidence) -> Finding:
-    effect, unit = "sampling", "% of points"
-    ranges = interval_ranges(evidence)
-    if not len(ranges):
-        return _unknown(effect, unit, _why_unknown(evidence))
-    share = (ranges > ALIASED).double().mean().item()
-    needed = share >= ALIASED_SHARE
-    reason = f"have sampling intervals that differ by more than {ALIASED:g} (median {ranges.median():.2f})"
-    reason += ": integrate over pixels, as the default footprint does" if needed else ""
-    return Finding(effect, 100 * share, unit, YES if needed else NO, "", reason)
+def _intervals(evidence: Evidence, items: list[Photograph]) -> tuple[Finding, Finding]:
+    """Whether the range of sampling intervals calls for integration over pixels, and for several scales."""
+    unit, ranges = "% of points", interval_ranges(evidence)
 
+    def finding(effect: str, limit: float, least: float, median: str, option: str, advice: str) -> Finding:
+        if not len(ranges):
+            return _unknown(effect, unit, _why_unknown(evidence))
+        share = (ranges > limit).double().mean().item()
+        needed = share >= least
+        reason = f"have sampling intervals that differ by more than {limit:g}{median}{advice if needed else ''}"
+        return Finding(effect, 100 * share, unit, YES if needed else NO, option if needed else "", reason)
 
-def _scales(evidence: Evidence, items: list[Photograph]) -> Finding:
-    effect, unit = "scales", "% of points"
+    median = f" (median {ranges.median():.2f})" if len(ranges) else ""
+    advice = ": integrate over pixels, as the default footprint does"
+    sampling = finding("sampling", ALIASED, ALIASED_SHARE, median, "", advice)
     stored = sorted({scale for item in items for scale in item.files})
     if len(stored) > 1:
-        scales = ",".join(map(str, stored))
-        return Finding(effect, len(stored), "sizes", YES, f"--scales {scales}", "of each picture are in the capture")
-    ranges = interval_ranges(evidence)
-    if not len(ranges):
-        return _unknown(effect, unit, _why_unknown(evidence))
-    share = (ranges > SEVERAL_SCALES).double().mean().item()
-    needed = share >= SCALES_SHARE
-    reason = f"have sampling intervals that differ by more than {SEVERAL_SCALES:g}"
-    return Finding(effect, 100 * share, unit, YES if needed else NO, f"--scales {SCALES}" if needed else "", reason)
+        option = f"--scales {','.join(map(str, stored))}"
+        return sampling, Finding("scales", len(stored), "sizes", YES, option, "of each picture are in the capture")
+    return sampling, finding("scales", SEVERAL_SCALES, SCALES_SHARE, "", f"--scales {SCALES}", "")
 
 
 def _outlying(items: list[Photograph], outliers: dict[int, float]) -> Finding:

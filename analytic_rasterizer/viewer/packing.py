@@ -258,8 +258,7 @@ def _view_entry(view: io.View) -> dict:
     entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
     if view.lens is not None:
         entry["name"] += " (without its lens)"  # the page has pinholes
-    entry["cx"] = view.width / 2 if view.cx is None else view.cx
-    entry["cy"] = view.height / 2 if view.cy is None else view.cy
+    entry["cx"], entry["cy"] = view.middle
     return entry | {"w2c": view.w2c.flatten().tolist()}
 
 
