@@ -630,11 +630,10 @@ def test_the_way_back_is_taken_once(runs):
 OPS = ("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_")
 
 
-@pytest.fixture
-def calls(device):
-    """Arguments of the ops for two cameras, and the rows and gradients that they make."""
-    ops, scenario = torch.ops.analytic_rasterizer, SCENARIOS["one-rank"]
-    settings = [settings_of(scenario, device)[0]] * 2
+def calls_of(device, camera=0):
+    """Arguments of the ops for twice such a camera of `CAMERAS`, and the rows and gradients that they make."""
+    ops, scenario = torch.ops.analytic_rasterizer, dataclasses.replace(SCENARIOS["one-rank"], cameras=(camera,))
+    settings = settings_of(scenario, device) * 2
     gaussians = dict.fromkeys(("colors_precomp", "cov3D_precomp")) | scene_of(scenario.dtype, device)
     own, batch = ar.stages.project_arguments(settings, **gaussians)
     arguments = own | batch
@@ -665,6 +664,30 @@ def calls(device):
     needs = [name in ("means3D", "opacities", "shs", "scales", "rotations") for name in arguments][:11]
     adjoint = arguments | {"dL_drows": dL_drows, "ids": ids, "needs": needs} | places
     return dict(zip(OPS, (arguments, packed, adjoint, blended, back)))
+
+
+@pytest.fixture
+def calls(device):
+    return calls_of(device)
+
+
+@pytest.mark.parametrize("camera", [camera for camera in range(len(CAMERAS)) if camera != UNSEEING])
+def test_gradients_of_rows_are_those_of_blend(camera, device):
+    """To the bit, though `blend` takes other kernels on CUDA: for channels in rows of their own."""
+    scenario = dataclasses.replace(SCENARIOS["one-rank"], cameras=(camera,))
+    (settings,) = settings_of(scenario, device)
+    splats = ar.project(settings, **scene_of(scenario.dtype, device))
+    names = ("means2d", "cov2d", "opacities", "colors")
+    leaves = {name: getattr(splats, name).detach().clone().requires_grad_() for name in names}
+    splats = dataclasses.replace(splats, **leaves)
+    absolute = torch.zeros_like(splats.means2d, requires_grad=True)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats), background=settings.bg, means2d_abs=absolute)
+    (image.sum() + alpha.sum()).backward()
+    rows = calls_of(device, camera)["blend_rows_vjp_"]["dL_drows"]
+    made = [leaf.grad.view(len(rows), -1) for leaf in (*leaves.values(), absolute)]
+    different = (rows != torch.cat(made, 1)).nonzero().tolist()
+    assert not different, (different, (rows - torch.cat(made, 1)).abs().max())
+    assert all(leaf.grad.any() for leaf in leaves.values())
 
 
 def test_rows_hold_what_project_returns(calls, device):

@@ -83,20 +83,26 @@ template <class F, int C> class LanePixels {
   VjpSample samples_[F::kSamples][kSubtiles];    ///< if kHoldsSamples
 };
 
+/// The k-th subtile that lanes visit: of a footprint one order for all C, so that all C have the same bits of sums.
+template <class F> constexpr int visited_subtile(int k) {
+  return F::kSamples == 1 && !F::kExpensive ? (k & 4) | (k & 1) << 1 | (k >> 1 & 1) : k;
+}
+
 /// Calls visit(b, position_in(b, of_first)) for the subtiles b of a set.
 template <class F, int C, class Visit>
 __device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> of_first, Visit&& visit) {
   if constexpr (kTakesTwo<F, C>) {
 #pragma unroll
     for (int q = 0; q < kSubtiles / 2; ++q) {
-      const int upper = q % 2 + q / 2 * 4, lower = upper + 2;
+      const int upper = visited_subtile<F>(2 * q), lower = visited_subtile<F>(2 * q + 1);
       if (!(subtiles & (1u << upper | 1u << lower))) continue;
       visit(upper, position_in<F>(upper, of_first));
       visit(lower, position_in<F>(lower, of_first));
     }
   } else if constexpr (kUnrollsSubtiles<F, C>) {
 #pragma unroll
-    for (int b = 0; b < kSubtiles; ++b) {
+    for (int k = 0; k < kSubtiles; ++k) {
+      const int b = visited_subtile<F>(k);
       if (subtiles >> b & 1) visit(b, position_in<F>(b, of_first));
     }
   } else {
