@@ -130,6 +130,8 @@ def test_lenses_of_nerfstudio(tmp_path):
         frame(is_fisheye=True, k1=0.01),
         frame(camera_model="FULL_OPENCV", k1=-0.1, k4=0.01),
         frame(camera_model="EQUIRECTANGULAR"),
+        frame(camera_model="OPENCV_FISHEYE", is_fisheye=True, k1=0.01),
+        frame(camera_model="EQUIRECTANGULAR", is_fisheye=False),
     ]
     views = io.load_views(write_transforms(tmp_path / "transforms.json", frames))
     assert [view.lens for view in views] == [
@@ -140,6 +142,8 @@ def test_lenses_of_nerfstudio(tmp_path):
         None,
         ar.Lens.fisheye((0.01,)),
         ar.Lens.perspective((-0.1, 0, 0, 0.01)),
+        ar.Lens.equirectangular(),
+        ar.Lens.fisheye((0.01,)),
         ar.Lens.equirectangular(),
     ]
     assert views[-1].fx == pytest.approx(640 / (2 * math.pi)) and views[-1].middle == (320, 240)
@@ -156,11 +160,17 @@ def test_lenses_of_nerfstudio(tmp_path):
             {"camera_model": "EQUIRECTANGULAR", "k1": 1.0},
             "frame 0: EQUIRECTANGULAR must have no coefficients, got k1",
         ),
-        ({"k4": 0.1}, "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1"),
+        (
+            {"k4": 0.1},
+            "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1; .* 8th power, "
+            "which OpenCV's lens does not have: undistort the pictures first, or fit FULL_OPENCV",
+        ),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "a lens of OPENCV must have no .*, got is_fisheye = True"),
         ({"distortion_params": [0.0, 0.1]}, r"got distortion_params = \[0.0, 0.1\]; undistort the pictures first"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE must have no coefficients but k1, k2, k3, k4"),
         ({"k1": math.nan}, "frame 0: every number of radial must be finite, got nan"),
         ({"k1": "much"}, "frame 0: every number of radial must be a number, got 'much'"),
+        ({"k1": 10**400}, "frame 0: every number of radial must be finite, got 1000"),
         ({"k1": True}, "frame 0: every number of radial must be a number, got True"),
     ],
 )
