@@ -59,6 +59,27 @@ def test_pixels_are_those_of_pycolmap(model):
     assert np.abs(got - camera.img_from_cam(points)).max() < 1e-9
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("model", ["perspective", "fisheye"])
+def test_positions_are_those_of_opencv(model, sign):
+    """To 1e-9 focal lengths, in front of the camera, with all of OpenCV's coefficients; also next to the axis."""
+    cv2 = pytest.importorskip("cv2", reason="compares with OpenCV")
+    points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 2.0), (500, 3))
+    points[::5, :2] *= 1e-6
+    zero, one = np.zeros(3), np.eye(3)
+    if model == "perspective":
+        radial, tangential, prism = (0.1, -0.05, 0.02, 0.03, 0.02, -0.01), (0.01, -0.02), (0.01, 0.02, -0.01, 0.005)
+        lens = ar.Lens.perspective(*([sign * k for k in part] for part in (radial, tangential, prism)))
+        k = np.array(lens.coefficients)[[0, 1, 6, 7, 2, 3, 4, 5, 8, 9, 10, 11]]
+        expected = cv2.projectPoints(points, zero, zero, one, k)[0]
+    else:
+        points[:, :2] *= 3
+        lens = ar.Lens.fisheye([sign * k for k in (0.05, 0.01, -0.001, 0.0003)])
+        expected = cv2.fisheye.projectPoints(points[:, None], zero, zero, one, np.array(lens.coefficients[:4]))[0]
+    got = lens.project(torch.from_numpy(points))[0].numpy()
+    assert np.abs(got - expected.reshape(-1, 2)).max() < 1e-9
+
+
 @pytest.mark.parametrize("model", PARAMETERS)
 def test_rays_are_what_pixels_show(model):
     view = view_of(model)
