@@ -265,3 +265,30 @@ def test_opcheck(device, lens):
         if lens in (TRACED, SPHERE) and not (device == "cuda" and name == "rasterize"):  # see test_api.py
             checks.append("test_aot_dispatch_dynamic")
         torch.library.opcheck(function, torch.utils._pytree.tree_map(copied, arguments), test_utils=checks)
+
+
+@each_lens
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.0])
+def test_defocus_and_motion_through_a_lens(lens, angle):
+    """A point's streak is that which the lens shows, and its disc depends on the depth by which the lens orders."""
+    if angle >= lens.fold:
+        pytest.skip("the model sees less")
+    mean = 3 * turned_to(torch.tensor(angle))[:3, 2:3].T
+    velocity, turn = torch.tensor([0.1, -0.2, 0.15]).double(), torch.tensor([0.05, 0.03, -0.04]).double()
+    defocus, motion = ar.Defocus(0.4, 1.5), ar.Motion(0.5, velocity, turn, (3.0, -2.0))
+    gaussian = {"means3D": mean, "scales": torch.full((1, 3), 0.02, dtype=torch.float64)}
+    gaussian |= {"rotations": torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)}
+    gaussian |= {"opacities": torch.ones(1, 1).double(), "colors_precomp": torch.ones(1, 3).double()}
+    middle = 10 * lens.project(mean)[0][0]
+    camera = {"fx": 10.0, "fy": 12.0, "cx": 24 - middle[0].item(), "cy": 18 - 1.2 * middle[1].item()}
+    plain = ar.project(settings_of(lens, **camera), **gaussian)
+    blurred = ar.project(settings_of(lens, **camera, defocus=defocus, motion=motion), **gaussian)
+    seen_from = -(velocity + torch.linalg.cross(turn, mean[0]))  # of the point, from the camera
+    ends, _ = lens.project(torch.stack([mean[0] - 1e-5 * seen_from, mean[0] + 1e-5 * seen_from]))
+    focal, screen = torch.tensor([10.0, 12.0]).double(), torch.tensor([3.0, -2.0]).double()
+    streak = 0.5 * (focal * (ends[1] - ends[0]) / 2e-5 + screen)
+    disc = 0.4 * (1 / 1.5 - 1 / lens.depths(mean)[0])
+    added = torch.stack([streak[0] ** 2, streak[0] * streak[1], streak[1] ** 2]) / 12
+    added = added + 10 * 12 * disc**2 / 16 * torch.tensor([1, 0, 1])
+    torch.testing.assert_close(blurred.cov2d[0] - plain.cov2d[0], added, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(blurred.means2d, plain.means2d)
