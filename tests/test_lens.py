@@ -563,6 +563,11 @@ def test_what_the_sphere_refuses():
         rasterize(sphere())(**scene | {"means2D": torch.zeros(10, 2, dtype=torch.float64)})
     with pytest.raises(TypeError, match="means2D must have the dtype of means3D"):
         rasterize(sphere())(**scene | {"means2D": torch.zeros(10, 3)})
+    features = {"shs": None, "colors_precomp": torch.rand(10, 5, dtype=torch.float64)}
+    settings = sphere(bg=torch.zeros(5, dtype=torch.float64))
+    for wrong, error in ((torch.ones(11, 1, dtype=torch.float64), ValueError), (None, TypeError)):
+        with pytest.raises(error, match="opacities must "):
+            rasterize(settings)(**scene | features | {"opacities": wrong})
     with pytest.raises(ValueError, match="exactly one of shs and colors_precomp must be given, got both"):
         rasterize(sphere())(**scene, colors_precomp=scene["means3D"])
     with pytest.raises(ValueError, match="cameras must have no equirectangular lens"):
