@@ -19,6 +19,8 @@ _PARTS = {
     "fisheye": ((4, 0), (2, 6), (4, 8)),
     "rad_tan_fisheye": ((6, 0), (2, 6), (4, 8)),
 }
+# And the coefficients that a model does not have, by their places in words.
+_ABSENT = {"fisheye": {"4 and 5": slice(4, 6)}, "fov": {"from 1 on": slice(1, SIZE)}}
 SPHERE = "equirectangular"
 MODELS = (*_PARTS, "fov", SPHERE)
 WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis, about the axis
@@ -44,8 +46,8 @@ class Lens:
             pi/2; None: half a pixel from the poles, as far as the nearest row of pixel centres.
 
     Raises:
-        TypeError: Coefficients are no numbers.
-        ValueError: An unknown model, or too many coefficients, or numbers that are not finite.
+        TypeError: Coefficients or reach are no numbers.
+        ValueError: An unknown model, or coefficients that it does not have, or numbers that are not finite.
     """
 
     model: str
@@ -64,10 +66,17 @@ class Lens:
             object.__setattr__(self, "coefficients", numbers + (0.0,) * (SIZE - len(numbers)))
             if self.model == "fov" and not 0 < self.coefficients[0] < math.pi:
                 raise ValueError(f"w of a fov lens must be above 0 and below pi, got {self.coefficients[0]}")
+            for where, none in _ABSENT.get(self.model, {}).items():
+                if any(self.coefficients[none]):
+                    raise ValueError(f"coefficients {where} of a {self.model} lens must be zero, got {given}")
         if self.model == SPHERE and (isinstance(given, torch.Tensor) or any(self.coefficients)):
             raise ValueError(f"coefficients of an equirectangular lens must be zero, got {given}")
-        if self.reach is not None and not 0 < self.reach <= math.pi:
-            raise ValueError(f"reach must be above 0 and at most pi, got {self.reach}")
+        if self.reach is not None:
+            if isinstance(self.reach, torch.Tensor):
+                raise TypeError(f"reach must be a number, got {self.reach!r}")
+            check_number("reach", self.reach, above=0)
+            if self.reach > math.pi:
+                raise ValueError(f"reach must be at most pi, got {self.reach}")
         if self.model == SPHERE and self.reach is not None and not self.reach < math.pi / 2:
             raise ValueError(f"reach of an equirectangular lens must be below pi/2, got {self.reach}")
 
@@ -147,7 +156,8 @@ class Lens:
             points: (N, 3) in the camera's frame: x right, y down, z forward.
 
         Returns:
-            positions: (N, 2) float64 on the CPU; NaN beyond `fold`, where the lens shows nothing.
+            positions: (N, 2) float64 on the CPU; NaN beyond `fold`, where the lens shows nothing, and for points that
+                are not finite or at the camera.
             derivatives: (N, 2, 3) of the positions by the points, likewise.
 
         Raises:
@@ -155,11 +165,13 @@ class Lens:
             ValueError: They do not have the shape (N, 3).
         """
         points = _rows("points", points, 3)
-        positions, derivatives = _C.lens_points(self.model, list(self.numbers()), points)
-        hidden = torch.atan2(points[:, :2].norm(dim=1), points[:, 2]) > self.fold
+        size = points.abs().amax(1, keepdim=True)  # only the direction counts: squares of large points overflow
+        rays = points / size
+        positions, derivatives = _C.lens_points(self.model, list(self.numbers()), rays)
+        hidden = ~(torch.atan2(rays[:, :2].norm(dim=1), rays[:, 2]) <= self.fold)
         if hidden.any():
             positions[hidden], derivatives[hidden] = math.nan, math.nan
-        return positions, derivatives
+        return positions, derivatives / size[:, None]
 
     def unproject(self, positions: torch.Tensor) -> torch.Tensor:
         """(N, 3) unit vectors in the camera's frame that the lens shows at `positions` (N, 2).
@@ -174,8 +186,9 @@ class Lens:
         positions = _rows("positions", positions, 2)
         if self.model == SPHERE:
             longitude, latitude = positions.unbind(1)
-            across = torch.where(latitude.abs() <= math.pi / 2, latitude.cos(), math.nan)
-            return torch.stack([across * longitude.sin(), latitude.sin() + 0 * across, across * longitude.cos()], 1)
+            rays = torch.stack([latitude.cos() * longitude.sin(), latitude.sin(), latitude.cos() * longitude.cos()], 1)
+            shown = longitude.isfinite() & (latitude.abs() <= math.pi / 2)
+            return torch.where(shown[:, None], rays, math.nan)
         # The unknown is the angle from the axis times the unit vector across it. The first guess is the angle that the
         # lens shows at this distance along x.
         angles = torch.linspace(0, self.fold, 8 * _ANGLES, dtype=torch.float64)
@@ -315,13 +328,15 @@ def _fold(model: str, coefficients: tuple[float, ...]) -> float:
         slopes = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[1].reshape(*ray.shape[:2], 2, 3)
         u, v = (slopes * along[..., None, :]).sum(-1), (slopes * across[..., None, :]).sum(-1)
         area = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-        good = ((area > 0) & area.isfinite()).all(1).tolist()
+        # Away from the axis it goes on outwards: turned about it would have a positive area, too.
+        outwards = u[..., 0] * across[..., 1] - u[..., 1] * across[..., 0]
+        good = ((area > 0) & area.isfinite() & (outwards > 0)).all(1).tolist()
         if all(good):
             return last
         k = good.index(False)
-        if k == 0:
-            raise ValueError(f"the {model} lens with coefficients {coefficients} is no map at its axis")
-        first, last = float(angles[k - 1]), float(angles[k])
+        first, last = float(angles[max(k - 1, 0)]), float(angles[k])
+    if not first:
+        raise ValueError(f"the {model} lens with coefficients {coefficients} is no map at its axis")
     return first
 
 
@@ -331,8 +346,8 @@ def _reach(model: str, coefficients: tuple[float, ...], tan_x: float, tan_y: flo
     angles = torch.linspace(0, fold, _ANGLES + 1, dtype=torch.float64)
     ray = _rays(angles)[0]
     seen = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[0].reshape(*ray.shape[:2], 2)
-    inside = ((seen[..., 0] - x).abs() <= tan_x) & ((seen[..., 1] - y).abs() <= tan_y)
-    inside = inside.any(1).nonzero()
+    # Nearer to the axis than the farthest corner, in any direction: a strip of a picture may lie between the rays.
+    inside = (seen.norm(dim=2) <= math.hypot(abs(x) + tan_x, abs(y) + tan_y)).any(1).nonzero()
     largest = float(angles[min(int(inside[-1]) + 1, _ANGLES)]) if len(inside) else fold
     clamp = _C.FRUSTUM_CLAMP
     return min(fold, clamp * largest if model in WIDE else math.atan(clamp * math.tan(largest)))

@@ -16,6 +16,13 @@ def check_number(name: str, value, at_least: float = -math.inf, above: float = -
         return  # the value is not examined: on a device that would have to be waited for
     if isinstance(value, bool) or not isinstance(value, Real):  # numpy's are Real too
         raise TypeError(f"{name} must be a number, got {value!r}")
-    if not (math.isfinite(value) and value >= at_least and value > above):
+    if not (_is_finite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
+
+
+def _is_finite(value: Real) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer of hundreds of digits, as JSON may have
+        return False

@@ -72,7 +72,8 @@ def render_sphere(
     bg, bg_image = split_background(bg, colors_precomp, size)
     three = colors_precomp is None or colors_precomp.shape[1] == 3
     given = [t for t in (None if three else colors_precomp, features) if t is not None]
-    for tensor in given:  # a row that is not finite culls its Gaussian
+    fits = isinstance(opacities, torch.Tensor) and opacities.numel() == len(means3D)  # else `project` raises
+    for tensor in given if fits else ():  # a row that is not finite culls its Gaussian
         opacities = torch.where(tensor.isfinite().all(1).reshape(opacities.shape), opacities, 0)
 
     splats, turns = project_once(

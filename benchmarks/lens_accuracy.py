@@ -250,6 +250,9 @@ def picture_table(args: argparse.Namespace) -> list[dict]:
     if args.scene:
         trained = load_scene(args.scene).map(torch.Tensor.double).with_sh_degree(0)
         view = io.load_views(args.views)[0]
+        if args.limit:
+            widest = camera("fisheye", max(args.fovs), tuple(args.size), view.w2c)
+            trained = most_seen(trained, replace(widest, lens=CAMERAS["fisheye"]), args.limit)
     print(markdown_table(["camera", "field of view", "splats", *COLUMNS], []), flush=True)
     for sigma in [None] if trained else args.sigmas:
         for fov in args.fovs:
@@ -273,6 +276,15 @@ def picture_table(args: argparse.Namespace) -> list[dict]:
                 )
                 rows.append(row)
     return rows
+
+
+def most_seen(scene: Gaussians, view: io.View, count: int) -> Gaussians:
+    """The Gaussians that a picture shows most of."""
+    settings = view.settings(
+        sh_degree=0, footprint=FOOTPRINTS[1], dtype=torch.float64, effects=ar.Effects(gaussian_stats=True)
+    )
+    stats = ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())[2].gaussian_stats
+    return scene.rows(stats.sum_weight.argsort(descending=True, stable=True)[:count].sort().values)
 
 
 def in_words(name: str, value: str | float | None) -> str:
@@ -373,6 +385,12 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add = parser.add_argument
     add("scene", nargs="?", help="trained scene in place of random ones: .ply, or .npz (see scene_files.py)")
+    add(
+        "--limit",
+        type=int,
+        metavar="N",
+        help="of a trained scene only the N Gaussians that the widest fisheye shows most of",
+    )
     add("--views", help="file of views of the scene, of which the first gives the pose")
     add("--fovs", nargs="+", type=float, default=FOVS, help="degrees from the left to the right edge")
     add("--sigmas", nargs="+", type=float, default=SIGMAS, help="px")

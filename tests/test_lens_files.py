@@ -59,6 +59,27 @@ def test_pixels_are_those_of_pycolmap(model):
     assert np.abs(got - camera.img_from_cam(points)).max() < 1e-9
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("model", ["perspective", "fisheye"])
+def test_positions_are_those_of_opencv(model, sign):
+    """To 1e-9 focal lengths, in front of the camera, with all of OpenCV's coefficients; also next to the axis."""
+    cv2 = pytest.importorskip("cv2", reason="compares with OpenCV")
+    points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 2.0), (500, 3))
+    points[::5, :2] *= 1e-6
+    zero, one = np.zeros(3), np.eye(3)
+    if model == "perspective":
+        radial, tangential, prism = (0.1, -0.05, 0.02, 0.03, 0.02, -0.01), (0.01, -0.02), (0.01, 0.02, -0.01, 0.005)
+        lens = ar.Lens.perspective(*([sign * k for k in part] for part in (radial, tangential, prism)))
+        k = np.array(lens.coefficients)[[0, 1, 6, 7, 2, 3, 4, 5, 8, 9, 10, 11]]
+        expected = cv2.projectPoints(points, zero, zero, one, k)[0]
+    else:
+        points[:, :2] *= 3
+        lens = ar.Lens.fisheye([sign * k for k in (0.05, 0.01, -0.001, 0.0003)])
+        expected = cv2.fisheye.projectPoints(points[:, None], zero, zero, one, np.array(lens.coefficients[:4]))[0]
+    got = lens.project(torch.from_numpy(points))[0].numpy()
+    assert np.abs(got - expected.reshape(-1, 2)).max() < 1e-9
+
+
 @pytest.mark.parametrize("model", PARAMETERS)
 def test_rays_are_what_pixels_show(model):
     view = view_of(model)
@@ -130,6 +151,8 @@ def test_lenses_of_nerfstudio(tmp_path):
         frame(is_fisheye=True, k1=0.01),
         frame(camera_model="FULL_OPENCV", k1=-0.1, k4=0.01),
         frame(camera_model="EQUIRECTANGULAR"),
+        frame(camera_model="OPENCV_FISHEYE", is_fisheye=True, k1=0.01),
+        frame(camera_model="EQUIRECTANGULAR", is_fisheye=False),
     ]
     views = io.load_views(write_transforms(tmp_path / "transforms.json", frames))
     assert [view.lens for view in views] == [
@@ -140,6 +163,8 @@ def test_lenses_of_nerfstudio(tmp_path):
         None,
         ar.Lens.fisheye((0.01,)),
         ar.Lens.perspective((-0.1, 0, 0, 0.01)),
+        ar.Lens.equirectangular(),
+        ar.Lens.fisheye((0.01,)),
         ar.Lens.equirectangular(),
     ]
     assert views[-1].fx == pytest.approx(640 / (2 * math.pi)) and views[-1].middle == (320, 240)
@@ -156,11 +181,17 @@ def test_lenses_of_nerfstudio(tmp_path):
             {"camera_model": "EQUIRECTANGULAR", "k1": 1.0},
             "frame 0: EQUIRECTANGULAR must have no coefficients, got k1",
         ),
-        ({"k4": 0.1}, "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1"),
+        (
+            {"k4": 0.1},
+            "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1; .* 8th power, "
+            "which OpenCV's lens does not have: undistort the pictures first, or fit FULL_OPENCV",
+        ),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "a lens of OPENCV must have no .*, got is_fisheye = True"),
         ({"distortion_params": [0.0, 0.1]}, r"got distortion_params = \[0.0, 0.1\]; undistort the pictures first"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE must have no coefficients but k1, k2, k3, k4"),
         ({"k1": math.nan}, "frame 0: every number of radial must be finite, got nan"),
         ({"k1": "much"}, "frame 0: every number of radial must be a number, got 'much'"),
+        ({"k1": 10**400}, "frame 0: every number of radial must be finite, got 1000"),
         ({"k1": True}, "frame 0: every number of radial must be a number, got True"),
     ],
 )

@@ -81,7 +81,9 @@ def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
     Raises SceneError, which begins with `where`.
     """
     said = {name: entry[name] for name in (*_COEFFICIENTS, *_OTHER_WORDS) if _says_something(entry.get(name))}
-    model = entry.get("camera_model") or ("OPENCV_FISHEYE" if said.pop("is_fisheye", None) is True else "OPENCV")
+    model = entry.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") is True else "OPENCV")
+    if model == "OPENCV_FISHEYE":
+        said.pop("is_fisheye", None)
     if model == SPHERICAL:
         if said:
             raise SceneError(f"{where}: {SPHERICAL} must have no coefficients, got {', '.join(said)}")
@@ -91,10 +93,16 @@ def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
     # COLMAP's FULL_OPENCV has k4, k5, k6 as divisors. nerfstudio's OPENCV has k4 on the polynomial of k1, k2, k3.
     known = {"OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"), FULL_OPENCV: _COEFFICIENTS}
     names = known.get(model, ("k1", "k2", "k3", "p1", "p2"))
-    for name in said.keys() - set(names):
+    for name in (name for name in said if name not in names):
+        way_out = "undistort the pictures first"
+        if (model, name) == ("OPENCV", "k4"):
+            way_out = (
+                "nerfstudio has it on the radius's 8th power, which OpenCV's lens does not have: "
+                f"{way_out}, or fit {FULL_OPENCV}"
+            )
         raise SceneError(
             f"{where}: a lens of {model} must have no coefficients but {', '.join(names)}, got {name} = {said[name]}; "
-            "undistort the pictures first"
+            f"{way_out}"
         )
     if model == "OPENCV_FISHEYE":
         return _made(lambda: Lens.fisheye([said.get(name, 0.0) for name in names]), where)
