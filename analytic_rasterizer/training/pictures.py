@@ -57,7 +57,7 @@ class Pictures(NamedTuple):
         return -(-self.store.plan.ahead * len(places) // waiting)
 
     def expect(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Has pictures fetched ahead, given as (view, scale) in the order in which they will be asked for."""
+        """Has the pictures of these `pairs`, (view, scale), fetched ahead, in the order of the steps that show them."""
         if self.horizon:
             self.store.expect((scale, view) for view, scale in pairs)
 

@@ -53,13 +53,13 @@ class PictureMemory(NamedTuple):
     processes: int = 1
 
     def check(self, device: torch.device) -> None:
-        """Raises ValueError for what is not a size, and for `gpu` without one."""
+        """Raises ValueError for what is not a size, and for `gpu` where `device` is none."""
         for name, value in (("picture_memory_gpu", self.gpu), ("picture_memory_host", self.host)):
             check_value(name, value is None or 0 <= value < math.inf, "finite and not negative", value)
         check_value("picture_memory_gpu", self.gpu is None or device.type == "cuda", "None on a CPU", self.gpu)
 
     def less(self, plan: Plan, device: torch.device) -> PictureMemory:
-        """What is left, beside the pictures of a `plan`, of limits that were given."""
+        """What is left of limits that were given, beside the pictures of a `plan` for a `device`."""
         places = {"gpu": DEVICE, "host": HOST if device.type == "cuda" else DEVICE}
         left = {name: (getattr(self, name), plan.taken[place] / GIB) for name, place in places.items()}
         return self._replace(
