@@ -50,11 +50,7 @@ class Pictures(NamedTuple):
     @property
     def horizon(self) -> int:
         """How many places of an order `expect` looks at; 0: all pictures are on the device."""
-        if self.store is None or self.store.plan.ahead == 0:
-            return 0
-        places = self.store.plan.places.values()
-        waiting = sum(place != DEVICE for place in places)
-        return -(-self.store.plan.ahead * len(places) // waiting)
+        return 0 if self.store is None else self.store.horizon
 
     def expect(self, pairs: Iterable[tuple[int, int]]) -> None:
         """Has the pictures of these `pairs`, (view, scale), fetched ahead, in the order of the steps that show them."""

@@ -211,6 +211,7 @@ class Store:
 
     Attributes:
         plan, kept: See above.
+        horizon: Of so many pictures in a row, those that wait are about as many as are fetched ahead.
     """
 
     def __init__(
@@ -227,6 +228,8 @@ class Store:
         self._expected: list[Key] = []
         self._shown: tuple[Key, Made] | None = None  # the last: its mask is asked for after its colour
         self._lock = Lock()
+        waiting = sum(place != DEVICE for place in plan.places.values())
+        self.horizon = -(-plan.ahead * len(plan.places) // max(waiting, 1))
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" and plan.ahead else None
 
     def get(self, key: Key) -> Made:
