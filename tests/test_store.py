@@ -2,6 +2,7 @@
 
 import json
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -182,7 +183,7 @@ def test_work_of_another_stream_is_waited_for(monkeypatch):
     plan = Plan({(1, 0): HOST}, {DEVICE: 0, HOST: 16, FILE: 0}, ahead=2, threads=1)
     kept = Store(CPU, plan, {(1, 0): made}, None, None)
     kept._stream, empty = Stream(), torch.empty
-    monkeypatch.setattr(torch.cuda, "stream", lambda stream: threading.Lock())
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: step)
     monkeypatch.setattr(torch, "empty", lambda *sizes, pin_memory, **options: empty(*sizes, **options))
     monkeypatch.setattr(torch.Tensor, "record_stream", lambda tensor, stream: told.append((tensor.shape, stream)))
@@ -193,7 +194,13 @@ def test_work_of_another_stream_is_waited_for(monkeypatch):
     kept.close()
 
 
-def test_pictures_are_read_in_strips_with_the_same_bits(tmp_path):
+@pytest.mark.parametrize("in_place", [True, False])
+def test_pictures_are_read_with_the_bits_of_pillow(tmp_path, monkeypatch, in_place):
+    taken = []
+    usual = photographs._as_memory_of
+    monkeypatch.setattr(
+        photographs, "_as_memory_of", lambda *given: taken.append(1) or (usual(*given) if in_place else None)
+    )
     rng = np.random.default_rng(3)
     rgb = image.fromarray(rng.integers(0, 256, (150, 9, 3), np.uint8))
     grey = rgb.convert("L")
@@ -204,6 +211,7 @@ def test_pictures_are_read_in_strips_with_the_same_bits(tmp_path):
         "rgba.png": (image.fromarray(rng.integers(0, 256, (150, 9, 4), np.uint8)), {}),
         "grey.jpg": (grey, {}),
         "rgb.jpg": (rgb, {}),
+        "progressive.jpg": (rgb, {"progressive": True, "subsampling": 0}),
         "cmyk.jpg": (rgb.convert("CMYK"), {}),
         "palette.png": (palette, {}),
         "palette_key.png": (palette, {"transparency": bytes(range(0, 160, 10))}),
@@ -216,6 +224,11 @@ def test_pictures_are_read_in_strips_with_the_same_bits(tmp_path):
         with image.open(tmp_path / name) as opened:
             expected = np.array(opened.convert("RGBA"))
         assert np.array_equal(photographs.read_picture(tmp_path / name).numpy(), expected), name
+    assert len(taken) == 2
+    (tmp_path / "rgb.jpg").write_bytes((tmp_path / "rgb.jpg").read_bytes()[:-400])
+    with pytest.raises(io.SceneError, match=r"rgb.jpg: unreadable or cut short \(image file is truncated"):
+        photographs.read_picture(tmp_path / "rgb.jpg")
+    assert usual(SimpleNamespace(size=None), np.empty((1, 1, 4), np.uint8)) is None
 
 
 # ---------------------------------------------------------------------------------- the places
@@ -356,7 +369,7 @@ class Slow:
         kept = {(1, views - 1): Made(torch.full((3, 1, 1), views - 1, dtype=torch.uint8), None)}
         self.store = Store(CPU, plan, kept, self.read, self.make)
 
-    def read(self, key):
+    def read(self, key, pinned):
         self.may.wait()
         self.asked.append(key[1])
         if key[1] in self.fails:

@@ -151,8 +151,8 @@ def load_pictures(
             stacklevel=2,
         )
 
-    def read(key: Key) -> dict[int, Stored]:
-        return _read_files(items[key[1]], key[:1])
+    def read(key: Key, pinned: Callable[[Tensor], Tensor]) -> dict[int, Stored]:
+        return {scale: stored.map(pinned) for scale, stored in _read_files(items[key[1]], key[:1]).items()}
 
     def make(key: Key, files: dict[int, Stored], moved: Callable[[Tensor], Tensor]) -> Made:
         return _make(items[key[1]], files, key[:1], recipe, moved)[1][key[0]]

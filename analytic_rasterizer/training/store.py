@@ -206,7 +206,8 @@ class Store:
         device: Of the pictures that it gives.
         plan: Where they are.
         kept: Those on the device and in memory.
-        read: Reads what is needed of the files for a picture. Called in threads, several at a time.
+        read: Reads what is needed of the files for a picture, and applies a function to its tensors, which pins memory.
+            Called in threads, several at a time.
         make: Makes a picture of what `read` returned, with a function that moves tensors to the device. One at a time.
 
     Attributes:
@@ -219,7 +220,7 @@ class Store:
         device: torch.device,
         plan: Plan,
         kept: dict[Key, Made],
-        read: Callable[[Key], Any],
+        read: Callable[[Key, Callable[[Tensor], Tensor]], Any],
         make: Callable[[Key, Any, Callable[[Tensor], Tensor]], Made],
     ):
         self.device, self.plan, self.kept, self._read, self._make = device, plan, kept, read, make
@@ -285,21 +286,25 @@ class Store:
     def _fetch(self, key: Key) -> tuple[Made, torch.cuda.Event | None]:
         """A picture on the device, and on CUDA the event after which it is there. Runs in a thread."""
         waiting = self.plan.places[key] == HOST
-        source = None if waiting else self._read(key)
-        # One at a time: this takes a small part of the time of decoding, but much memory.
-        with self._lock, nullcontext() if self._stream is None else torch.cuda.stream(self._stream):
-            made = self.kept[key].map(self._moved) if waiting else self._make(key, source, self._moved)
-            return made, None if self._stream is None else self._stream.record_event()
+        with nullcontext() if self._stream is None else torch.cuda.stream(self._stream):  # of this thread
+            source = self.kept[key].map(self._pinned) if waiting else self._read(key, self._pinned)
+            with self._lock:  # one at a time, for the memory that it takes while it is made
+                made = source.map(self._moved) if waiting else self._make(key, source, self._moved)
+                return made, None if self._stream is None else self._stream.record_event()
 
-    def _moved(self, tensor: Tensor) -> Tensor:
-        """On the device. The host does not wait for the copy."""
+    def _pinned(self, tensor: Tensor) -> Tensor:
+        """A copy in memory from which a device fetches while the host goes on, where there is one.
+
+        torch keeps such memory until copies from it are over, and then takes it again.
+        """
         if self._stream is None:
             return tensor
-        # torch keeps pinned memory until copies from it are over, and then takes it again. NumPy copies in this thread
-        # alone, where torch would start others.
         pinned = torch.empty(tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True)
-        np.copyto(pinned.numpy(), tensor.numpy())
-        return pinned.to(self.device, non_blocking=True)
+        np.copyto(pinned.numpy(), tensor.numpy())  # in this thread alone, where torch would start others
+        return pinned
+
+    def _moved(self, tensor: Tensor) -> Tensor:
+        return tensor.to(self.device, non_blocking=True)
 
 
 class Column(Sequence):
