@@ -283,7 +283,8 @@ def test_limits():
     ):
         with pytest.raises(ValueError, match=message):
             memory.check(CPU)
-    assert 0 < store.free_memory(CPU).host == store.free_memory(CPU).device
+    found = store.free_memory(CPU)
+    assert 0 < found.host == found.device
 
 
 def test_a_container_limits_what_is_free(monkeypatch):
@@ -505,3 +506,12 @@ def test_interruption_ends_the_threads(synthetic, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run.train()
     assert all(seen) and not alive()
+
+
+def test_a_broken_picture_ends_the_threads_that_read_others(tmp_path):
+    write_nerf_synthetic(tmp_path, circle(6), circle(2))
+    (tmp_path / "train" / "r_1.png").write_bytes((tmp_path / "train" / "r_1.png").read_bytes()[:-40])
+    capture = training.load_capture(tmp_path)
+    with pytest.raises(io.SceneError, match=r"r_1\.png: unreadable or cut short"):
+        training.load_pictures(capture.train, (1,), capture.background, "cpu")
+    assert not alive()

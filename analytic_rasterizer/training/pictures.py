@@ -7,6 +7,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -130,18 +131,19 @@ def load_pictures(
     plan = plan_places(sizes, pixels, limits_of(memory, free, device), free, device, memory.processes)
     views, settings, kept = [], {scale: [] for scale in scales}, {}
     to_turn = []
-    for number, (item, files) in enumerate(zip(items, _read_ahead(items, scales, plan.threads))):
-        if not files[1].header.tells_orientation(item.view):
-            to_turn.append(item.files[1])
-        view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
-        views.append(view)
-        for scale in scales:
-            place = plan.places[scale, number]
-            if place != FILE:
-                kept[scale, number] = of_scales[scale] if place == DEVICE else of_scales[scale].map(Tensor.cpu)
-            # In fractions: the cut makes both sizes multiples of the scale.
-            behind = (0.0, 0.0, 0.0) if background is None else background
-            settings[scale].append(view.settings(1 / scale, behind, device=device))
+    with closing(_read_ahead(items, scales, plan.threads)) as ahead:
+        for number, (item, files) in enumerate(zip(items, ahead)):
+            if not files[1].header.tells_orientation(item.view):
+                to_turn.append(item.files[1])
+            view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
+            views.append(view)
+            for scale in scales:
+                place = plan.places[scale, number]
+                if place != FILE:
+                    kept[scale, number] = of_scales[scale] if place == DEVICE else of_scales[scale].map(Tensor.cpu)
+                # In fractions: the cut makes both sizes multiples of the scale.
+                behind = (0.0, 0.0, 0.0) if background is None else background
+                settings[scale].append(view.settings(1 / scale, behind, device=device))
     if to_turn:
         named = ", ".join(str(path) for path in to_turn[:NAMED])
         warnings.warn(
@@ -221,7 +223,7 @@ def _stored(stored: Stored, item: Photograph, moved: Callable[[Tensor], Tensor])
 
 def _read_ahead(items: list[Photograph], scales: tuple[int, ...], threads: int) -> Iterator[dict[int, Stored]]:
     """What is stored of each photograph at every scale that is needed. Threads read some photographs ahead."""
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads, "pictures") as pool:
         ahead: deque = deque()
         try:
             for item in items:
