@@ -265,7 +265,7 @@ def test_threads_are_as_many_as_memory_allows(monkeypatch):
         assert plan.threads == expected
 
 
-def test_limits():
+def test_limits(monkeypatch):
     cuda, free = torch.device("cuda"), Bytes(80 * GIB, 128 * GIB)
     assert store.limits_of(PictureMemory(), free, cuda) == (20 * GIB, 64 * GIB)
     assert store.limits_of(PictureMemory(processes=4), free, cuda) == (5 * GIB, 16 * GIB)
@@ -285,6 +285,10 @@ def test_limits():
             memory.check(CPU)
     found = store.free_memory(CPU)
     assert 0 < found.host == found.device
+    numbers = {"mem_get_info": (100, 1000), "memory_reserved": 70, "memory_allocated": 50}
+    for name, value in numbers.items():
+        monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
+    assert store.free_memory(cuda).device == 120
 
 
 def test_a_container_limits_what_is_free(monkeypatch):

@@ -80,9 +80,12 @@ class Bytes(NamedTuple):
 
 
 def free_memory(device: torch.device) -> Bytes:
-    """What is free."""
+    """What is free, what torch keeps on the device for later included."""
     host = _free_on_host()
-    return Bytes(torch.cuda.mem_get_info(device)[0], host) if device.type == "cuda" else Bytes(host, host)
+    if device.type != "cuda":
+        return Bytes(host, host)
+    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return Bytes(torch.cuda.mem_get_info(device)[0] + kept, host)
 
 
 def _free_on_host() -> int:
