@@ -20,7 +20,7 @@ from ..io.common import naming
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .options import check_scales
-from .photographs import UPRIGHT, Header, Stored, read_file, read_header, read_mask
+from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size
 from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens
 
@@ -180,9 +180,9 @@ def _sizes(items: list[Photograph], scales: tuple[int, ...], recipe: Recipe) -> 
     sizes, pixels = {}, 0
     channels = 4 if recipe.background is None else 3
     with ThreadPoolExecutor() as pool:
-        for number, (item, header) in enumerate(zip(items, pool.map(lambda item: read_header(item.files[1]), items))):
-            pixels = max(pixels, header.width * header.height)
-            view = _view_of(item, header.width, header.height)
+        for number, (item, size) in enumerate(zip(items, pool.map(lambda item: read_size(item.files[1]), items))):
+            pixels = max(pixels, math.prod(size))
+            view = _view_of(item, *size)
             with naming(item.files[1]):
                 width, height = window_of(view)[2:4] if item.undistort else (view.width, view.height)
             planes = channels + (item.mask is not None or item.alpha_is_mask)
