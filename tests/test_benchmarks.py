@@ -21,7 +21,7 @@ from conftest import ROOT, python_path
 from processes import DEADLINE
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import io
+from analytic_rasterizer import io, training
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.dialects import DIALECTS
 from analytic_rasterizer.dialects.gsplat import rasterization
@@ -772,3 +772,34 @@ def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
     assert list(results) == ["pinhole, keep", "opencv, keep", "opencv, undistort", "fisheye, keep"]
     assert all(math.isfinite(value) for values in results.values() for value in values)
     assert "| fisheye, keep |" in capsys.readouterr().out
+
+
+def test_large_capture(tmp_path, monkeypatch, capsys):
+    """The photographs are those of the cameras, and trainings from every place have a row, and the same bits."""
+    numpy = pytest.importorskip("numpy")
+    pytest.importorskip("tqdm", reason="needs the train extra")
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.setenv("PYTHONPATH", python_path())
+    program = importlib.import_module("large_capture")
+    folder, results = tmp_path / "capture", tmp_path / "out.json"
+    monkeypatch.setattr(program, "WARM_UP", 2)
+    sizes = ["--count", "5", "--size", "64x48", "--points", "300", "--steps", "6", "--scales", "1,2"]
+    options = ["--footprint", "box:samples=1", "--device", "cpu", "--threads", "1", "--folder", folder]
+    monkeypatch.setattr(sys, "argv", ["large_capture.py", *sizes, *map(str, options), "--json", str(results)])
+    assert program.main() == 0
+    assert "the trained Gaussians have the same bits" in capsys.readouterr().out
+    on_device, in_files = json.loads(results.read_text())["places"]
+    assert on_device["ahead"] == 0 < in_files["ahead"]
+    whole = sum(3 * (64 // scale) * (48 // scale) for scale in (1, 2) for _ in range(5)) / 2**30
+    assert on_device["pictures_gib"] == whole and 0 < in_files["pictures_gib"] < whole
+    # The points have the colours of the pixels that they are seen in.
+    capture = training.load_capture(folder, test_every=0)
+    positions, colors = capture.points
+    for item in capture.train[:2]:
+        seen = positions.double() @ item.view.w2c[:3, :3].T + item.view.w2c[:3, 3]
+        at = (seen[:, :2] / seen[:, 2:] * item.view.fx + torch.tensor(item.view.middle)).floor().long()
+        within = ((at >= 0) & (at < torch.tensor([64, 48]))).all(1)
+        pixels = numpy.array(image.open(item.files[1]))[at[within, 1], at[within, 0]] / 255
+        error = abs(pixels - colors[within].numpy()).mean()
+        assert within.sum() > 50 and error < 0.05 < abs(pixels - pixels.mean(0)).mean()

@@ -33,7 +33,16 @@ from capture_files import (  # noqa: E402
 )
 
 from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import captures, colmap, files, pictures, placement, run, undistortion  # noqa: E402
+from analytic_rasterizer.training import (  # noqa: E402
+    captures,
+    colmap,
+    files,
+    photographs,
+    pictures,
+    placement,
+    run,
+    undistortion,
+)
 from analytic_rasterizer.training import model as g  # noqa: E402
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
@@ -148,7 +157,7 @@ def test_capture_is_read_as_it_was_taken(name, count, points):
     means, colors = capture.points
     assert len(capture.train) + len(capture.test) == count and len(means) == (points or len(means))
     item = capture.train[8]
-    view, rgba, _ = pictures.fitted(pictures.read_picture(item.files[1]), item, 16)
+    view, rgba, _ = pictures.fitted(photographs.read_picture(item.files[1]), item, 16)
     assert rgba.shape == (view.height, view.width, 4) and view.height % 16 == view.width % 16 == 0
     stages = render_stages(view.settings(), **point_inputs(means))
     colors = colors[stages.ids.long()]
@@ -448,7 +457,7 @@ def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
 
 
 def fitted(path, view, multiple):
-    return pictures.fitted(pictures.read_picture(path), training.Photograph(view, {1: path}), multiple)[:2]
+    return pictures.fitted(photographs.read_picture(path), training.Photograph(view, {1: path}), multiple)[:2]
 
 
 def test_cut_pictures_see_the_same(tmp_path):
@@ -517,7 +526,7 @@ def test_bicubic_reduction_is_that_of_pillow(scale):
 
 def test_sixteen_bits_are_rounded_to_eight(tmp_path):
     image.fromarray(np.array([[0, 257 * 100, 65535]], np.uint16)).save(tmp_path / "a.png")
-    assert pictures.read_picture(tmp_path / "a.png")[0, :, 0].tolist() == [0, 100, 255]
+    assert photographs.read_picture(tmp_path / "a.png")[0, :, 0].tolist() == [0, 100, 255]
 
 
 # ------------------------------------------------------------------------ captures of the field: one row each

@@ -14,7 +14,7 @@ image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 from capture_files import circle, draw_picture, write_colmap  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import files, pictures  # noqa: E402
+from analytic_rasterizer.training import files, photographs, pictures  # noqa: E402
 
 SIZE = (40, 36)
 POINTS = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5
@@ -137,19 +137,19 @@ def test_files_of_masks(tmp_path):
     levels = np.zeros((6, 8), np.uint8)
     levels[:3] = 1
     image.fromarray(levels).save(tmp_path / "ones.png")
-    assert pictures.read_mask(tmp_path / "ones.png", 8, 6).tolist() == [[255] * 8] * 3 + [[0] * 8] * 3
-    half = pictures.read_mask(tmp_path / "ones.png", 4, 3)
+    assert photographs.read_mask(tmp_path / "ones.png", 8, 6).tolist() == [[255] * 8] * 3 + [[0] * 8] * 3
+    half = photographs.read_mask(tmp_path / "ones.png", 4, 3)
     assert half.tolist() == [[255] * 4, [128] * 4, [0] * 4]
-    assert pictures.read_mask(tmp_path / "ones.png", 16, 12).tolist() == [[255] * 16] * 6 + [[0] * 16] * 6
+    assert photographs.read_mask(tmp_path / "ones.png", 16, 12).tolist() == [[255] * 16] * 6 + [[0] * 16] * 6
     image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "none.png")
-    assert (pictures.read_mask(tmp_path / "none.png", 8, 6) == 0).all()
+    assert (photographs.read_mask(tmp_path / "none.png", 8, 6) == 0).all()
     with pytest.raises(
         io.SceneError, match=r"ones.png: expected a mask of the shape of its picture, 8 x 8 px, got 8 x 6"
     ):
-        pictures.read_mask(tmp_path / "ones.png", 8, 8)
+        photographs.read_mask(tmp_path / "ones.png", 8, 8)
     (tmp_path / "broken.png").write_bytes(b"nothing")
     with pytest.raises(io.SceneError, match=r"broken.png: unreadable"):
-        pictures.read_mask(tmp_path / "broken.png", 8, 8)
+        photographs.read_mask(tmp_path / "broken.png", 8, 8)
 
 
 def test_alpha_may_be_a_mask(tmp_path):

@@ -20,7 +20,7 @@ from capture_files import looking_at_origin, quaternion, write_colmap_text  # no
 
 from analytic_rasterizer.training import colmap, evidence, plan  # noqa: E402
 from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
-from analytic_rasterizer.training.pictures import Stored  # noqa: E402
+from analytic_rasterizer.training.photographs import Stored  # noqa: E402
 from analytic_rasterizer.training.plan import EXPOSURE, NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
 
 COUNT, SIZE, HALF = 10, (160, 120), 3.0  # photographs, px, half the width of the wall that they show

@@ -67,8 +67,8 @@ def write_scene(folder):
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
-def make_run(scene, out, ranks, resume=False, **more):
-    return training.Run(scene, out, options_of(**more), save_every=0, resume=resume, ranks=ranks)
+def make_run(scene, out, ranks, resume=False, memory=None, **more):
+    return training.Run(scene, out, options_of(**more), save_every=0, resume=resume, memory=memory, ranks=ranks)
 
 
 def train_until(run, step):
@@ -120,15 +120,15 @@ def work(rank, world, folder):
 
 
 def repeat(scene, out, ranks, more):
-    """A training to its end, and once more with a break after about half of it."""
+    """A training to its end, and once more with a break after about half of it, and pictures in their files."""
     whole, part = (make_run(scene, out / name, ranks, **more) for name in ("whole", "part"))
     if whole.options.sparse_adam:
         for run in (whole, part):
             scatter(run.trainer.gaussians)
     whole.train()
     train_until(part, HALF)
-    part = make_run(scene, out / "part", ranks, resume=True)
-    assert part.progress.step == HALF
+    part = make_run(scene, out / "part", ranks, resume=True, memory=training.PictureMemory(host=0))
+    assert part.trainer.pictures.horizon and part.progress.step == HALF
     part.train()
 
 

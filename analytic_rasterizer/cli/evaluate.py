@@ -10,12 +10,13 @@ from ..analysis.tables import format_table
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
-from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
+from ..training import PictureMemory, TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
+from ..training.store import processes_here
 from ..training.trainer import background_of
 from .arguments import (
     add_machine_options,
@@ -137,9 +138,8 @@ def run_on(ranks: Ranks, args) -> None:
     scene = part_of(io.load_scene(found.path), ranks).to(args.device)
     if not seen_distance([item.view for item in capture.test], scene.means.cpu()):
         tell(f"warning: no test picture shows any Gaussian of {found.path}: was it trained on {protocol.data}?")
-    pictures = load_pictures(
-        capture.test, protocol.scales, background, args.device, options.downsampling, on_host=ranks.world > 1
-    )
+    memory = PictureMemory(processes=processes_here(ranks))
+    pictures = load_pictures(capture.test, protocol.scales, background, args.device, options.downsampling, memory)
     said = [] if protocol.options else differences(found, protocol, capture, background)
     chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
     tell(*capture.notes, *said, *chosen)

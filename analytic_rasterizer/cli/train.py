@@ -14,7 +14,7 @@ from pathlib import Path
 from .. import io
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
-from ..training import Run, TrainingOptions
+from ..training import PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
@@ -125,6 +125,11 @@ def add_parser(subcommands) -> None:
     )
     add("--port", type=port, metavar="N", help="of --watch: port to serve on (default: any free one)")
     add_machine_options(parser, device=None)
+    gpu = "GiB of the GPU for pictures, those of the next steps included; the bits are the same (default: 1/4 of what "
+    gpu += "is free, 1/16 with several processes)"
+    add("--picture-memory-gpu", type=float, metavar="GIB", help=gpu)
+    host = "GiB of memory for other pictures; the rest is decoded again and again (default: 1/2 of what is free)"
+    add("--picture-memory-host", type=float, metavar="GIB", help=host)
     add_rank_options(parser)
     rest = parser.add_argument_group("fine tuning", TIMES_TEXT)
     types, texts = typing.get_type_hints(TrainingOptions), attribute_texts(TrainingOptions)
@@ -209,6 +214,7 @@ def run_on(ranks: Ranks, args) -> bool:
         save_every=args.save_every,
         resume=args.resume,
         **length,
+        memory=PictureMemory(args.picture_memory_gpu, args.picture_memory_host),
         tensorboard=args.tensorboard,
         chosen=chosen,
         ranks=ranks,

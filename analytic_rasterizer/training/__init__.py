@@ -17,6 +17,7 @@ from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
+from .store import PictureMemory
 from .trainer import Trainer, starting_gaussians
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "CapturePlan",
     "Finding",
     "Photograph",
+    "PictureMemory",
     "Pictures",
     "Run",
     "Trainer",

@@ -109,6 +109,7 @@ def evaluate(
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         measured = {}
         for view, image in rendered(gaussians, settings, supersampling, ranks):
+            pictures.expect((later, scale) for later in range(view, len(settings), ranks.world))
             mask = pictures.mask(scale, view)
             image, truth = counted(image.clamp(0, 1), pictures.truth(scale, view), mask)
             values = [psnr(image, truth, mask), _mean_ssim(image, truth, mask)]
@@ -122,6 +123,7 @@ def evaluate(
         of_views = {view: values for of_rank in ranks.exchange(own) for view, values in of_rank.items()}
         views = [dict(zip(names, of_views[view])) for view in range(len(settings))]
         results[str(scale)] = _means(views) | {"views": views}
+    pictures.close()
     results["mean"] = _means([{k: v for k, v in of_scale.items() if k != "views"} for of_scale in results.values()])
     return results
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .layouts import Photograph
-from .pictures import read_file, read_mask
+from .photographs import read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
 MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and points behind which they may be hidden

@@ -3,83 +3,65 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from .. import io
-from ..io.common import opened_picture
+from ..io.common import naming
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .options import check_scales
-from .undistortion import without_lens
+from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size
+from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
+from .undistortion import window_of, without_lens
 
-ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
-TURNED = range(2, 9)  # its values for the others
 NAMED = 3  # files in a warning
 LEAST_SHARE = 1 / 512  # of a pixel that counts: less rounds to none
 
 
-class Header(NamedTuple):
-    """What a picture's file says without its pixels."""
-
-    width: int  # px, as stored
-    height: int
-    orientation: int  # as in `Stored`
-
-    def fits(self, view: io.View) -> bool:
-        """Whether the picture can be that of a camera, at this or another scale."""
-        return _is_reduced(self.width, self.height, view.width, view.height)
-
-    def fits_turned(self, view: io.View) -> bool:
-        """Whether it can be after a quarter turn."""
-        return _is_reduced(self.height, self.width, view.width, view.height)
-
-    def tells_orientation(self, view: io.View) -> bool:
-        """Whether it is certainly stored as its camera saw it: EXIF says so, or a quarter turn would not fit."""
-        quarter_turn = self.orientation in (5, 6, 7, 8)
-        return self.orientation not in TURNED or (quarter_turn and not self.fits_turned(view))
-
-
-class Stored(NamedTuple):
-    """The picture of a file."""
-
-    rgba: Tensor  # (H, W, 4) uint8 of straight alpha
-    orientation: int  # how the camera was held, as EXIF counts it
-    mask: Tensor | None = None  # (H, W) uint8, 255 where pixels count
-
-    @property
-    def header(self) -> Header:
-        """Size and orientation."""
-        return Header(self.rgba.shape[1], self.rgba.shape[0], self.orientation)
-
-
 class Pictures(NamedTuple):
-    """Views and their pictures, on the device or colours on its host. By scale: 2 is half the size.
+    """Views and their pictures. By scale: 2 is half the size.
 
     Attributes:
         views: At scale 1.
         settings: By scale, for every view.
         colors: By scale, for every view: (3, H, W) uint8, on the background; or (4, H, W) premultiplied, with alpha.
-            Black where nothing counts; otherwise the mean of what counts.
+            Black where nothing counts; otherwise the mean of what counts. Any device; those of a `store` that wait are
+            fetched when they are asked for.
         masks: By scale, for every view: (H, W) uint8, the share of each pixel that counts; None: all of them count,
             in all views if it stands for the dict.
+        store: Where `load_pictures` has put them; None: colours and masks are lists.
     """
 
     views: list[io.View]
     settings: dict[int, list[GaussianRasterizationSettings]]  # made once: they hold tensors
-    colors: dict[int, list[Tensor]]
-    masks: dict[int, list[Tensor | None]] | None = None
+    colors: dict[int, Sequence[Tensor]]
+    masks: dict[int, Sequence[Tensor | None]] | None = None
+    store: Store | None = None
+
+    @property
+    def horizon(self) -> int:
+        """How many places of an order `expect` looks at; 0: all pictures are on the device."""
+        return 0 if self.store is None else self.store.horizon
+
+    def expect(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Has the pictures of these `pairs`, (view, scale), fetched ahead, in the order of the steps that show them."""
+        if self.horizon:
+            self.store.expect((scale, view) for view, scale in pairs)
+
+    def close(self) -> None:
+        """Ends the threads that fetch pictures; the next one that is asked for starts others."""
+        if self.store is not None:
+            self.store.close()
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
         """The picture of a `view` at a `scale`, (3, H, W) float32 in [0, 1] on the device.
@@ -115,12 +97,14 @@ def load_pictures(
     background: tuple[float, float, float] | None,
     device: str | torch.device,
     downsampling: str = "box",
-    on_host: bool = False,
+    memory: PictureMemory | None = None,
 ) -> Pictures:
     """Reads photographs and reduces them.
 
     A picture that is to be undistorted is resampled to that of a pinhole, see `undistortion.without_lens`. All pictures
     are cut about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
+    Every file is read once, so that broken ones are found; pictures that do not fit into the memory that they may take
+    are read again when they are asked for.
 
     Args:
         items: What `load_capture` found.
@@ -128,38 +112,38 @@ def load_pictures(
         background: (r, g, b) in [0, 1] for pictures with alpha; None: keep alpha.
         device: Of the pictures and the settings.
         downsampling: As in `TrainingOptions`.
-        on_host: Keep colours in pinned memory of the host, from where each comes when it is asked for.
+        memory: How much of it pictures may take; None: the shares of `PictureMemory`.
 
     Warns of pictures that EXIF says to turn, unless their sizes show that they fit their cameras as they are stored.
     They are not turned.
 
     Raises:
-        io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales.
-        ValueError: Scales that are not whole numbers of at least 1.
+        io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales;
+            memory that does not suffice, before a picture is read.
+        ValueError: Scales that are not whole numbers of at least 1; `memory` that is none.
     """
     check_scales(scales)
-    pictures = Pictures([], *({scale: [] for scale in scales} for _ in range(3)))
+    device, memory = torch.device(device), memory or PictureMemory()
+    memory.check(device)
+    recipe = Recipe(math.lcm(*scales), background, downsampling)
+    sizes, pixels = _sizes(items, scales, recipe)
+    free = free_memory(device)
+    plan = plan_places(sizes, pixels, limits_of(memory, free, device), free, device, memory.processes)
+    views, settings, kept = [], {scale: [] for scale in scales}, {}
     to_turn = []
-    for item, files in zip(items, _read_ahead(items, scales)):
-        if not files[1].header.tells_orientation(item.view):
-            to_turn.append(item.files[1])
-        mask = None if files[1].mask is None else files[1].mask.to(device)
-        view, rgba, mask = fitted(files[1].rgba.to(device), item, math.lcm(*scales), mask)
-        pictures.views.append(view)
-        for scale in scales:
-            stored = scale if scale in item.files and scale != 1 else 1
-            whole, whole_mask = (rgba, mask) if stored == 1 else _stored(files[stored], item, device)
-            if whole.shape[:2] != (view.height // stored, view.width // stored):
-                raise io.SceneError(
-                    f"{item.files[stored]}: expected {view.width // stored} x {view.height // stored} px"
-                )
-            made = reduce(whole, scale // stored, background, downsampling, whole_mask)
-            color, share = (t.cpu().pin_memory() if on_host and t is not None and t.is_cuda else t for t in made)
-            pictures.colors[scale].append(color)
-            pictures.masks[scale].append(share)
-            # In fractions: the cut makes both sizes multiples of the scale.
-            behind = (0.0, 0.0, 0.0) if background is None else background
-            pictures.settings[scale].append(view.settings(1 / scale, behind, device=device))
+    with closing(_read_ahead(items, scales, plan.threads)) as ahead:
+        for number, (item, files) in enumerate(zip(items, ahead)):
+            if not files[1].header.tells_orientation(item.view):
+                to_turn.append(item.files[1])
+            view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
+            views.append(view)
+            for scale in scales:
+                place = plan.places[scale, number]
+                if place != FILE:
+                    kept[scale, number] = of_scales[scale] if place == DEVICE else of_scales[scale].map(Tensor.cpu)
+                # In fractions: the cut makes both sizes multiples of the scale.
+                behind = (0.0, 0.0, 0.0) if background is None else background
+                settings[scale].append(view.settings(1 / scale, behind, device=device))
     if to_turn:
         named = ", ".join(str(path) for path in to_turn[:NAMED])
         warnings.warn(
@@ -168,25 +152,88 @@ def load_pictures(
             + (", .." if len(to_turn) > NAMED else ""),
             stacklevel=2,
         )
-    return pictures
+
+    def read(key: Key, pinned: Callable[[Tensor], Tensor]) -> dict[int, Stored]:
+        return {scale: stored.map(pinned) for scale, stored in _read_files(items[key[1]], key[:1]).items()}
+
+    def make(key: Key, files: dict[int, Stored], moved: Callable[[Tensor], Tensor]) -> Made:
+        return _make(items[key[1]], files, key[:1], recipe, moved)[1][key[0]]
+
+    store = Store(device, plan, kept, read, make)
+    if plan.ahead:
+        fields = columns(store, scales, len(items))
+    else:
+        fields = ({scale: [kept[scale, i][k] for i in range(len(items))] for scale in scales} for k in range(2))
+    return Pictures(views, settings, *fields, store)
 
 
-def _stored(stored: Stored, item: Photograph, device: str | torch.device) -> tuple[Tensor, Tensor | None]:
+class Recipe(NamedTuple):
+    """How pictures are made of photographs."""
+
+    multiple: int  # px, of their sizes at scale 1
+    background: tuple[float, float, float] | None
+    downsampling: str
+
+
+def _sizes(items: list[Photograph], scales: tuple[int, ...], recipe: Recipe) -> tuple[dict[Key, int], int]:
+    """Bytes of every picture, and pixels of the largest photograph, by what the files say before they are decoded."""
+    sizes, pixels = {}, 0
+    channels = 4 if recipe.background is None else 3
+    with ThreadPoolExecutor() as pool:
+        for number, (item, size) in enumerate(zip(items, pool.map(lambda item: read_size(item.files[1]), items))):
+            pixels = max(pixels, math.prod(size))
+            view = _view_of(item, *size)
+            with naming(item.files[1]):
+                width, height = window_of(view)[2:4] if item.undistort else (view.width, view.height)
+            planes = channels + (item.mask is not None or item.alpha_is_mask)
+            for scale in scales:
+                lengths = ((length - length % recipe.multiple) // scale for length in (width, height))
+                sizes[scale, number] = planes * math.prod(lengths)
+    return sizes, pixels
+
+
+def _make(
+    item: Photograph,
+    files: dict[int, Stored],
+    scales: tuple[int, ...],
+    recipe: Recipe,
+    moved: Callable[[Tensor], Tensor],
+) -> tuple[io.View, dict[int, Made]]:
+    """The view of a photograph, and its pictures at some scales, of what its files have.
+
+    `moved` gives a tensor of the host on the device, on which pictures are made: another one would round otherwise.
+    """
+    mask = None if files[1].mask is None else moved(files[1].mask)
+    view, rgba, mask = fitted(moved(files[1].rgba), item, recipe.multiple, mask)
+    made = {}
+    for scale in scales:
+        stored = scale if scale in item.files and scale != 1 else 1
+        whole, whole_mask = (rgba, mask) if stored == 1 else _stored(files[stored], item, moved)
+        if whole.shape[:2] != (view.height // stored, view.width // stored):
+            raise io.SceneError(f"{item.files[stored]}: expected {view.width // stored} x {view.height // stored} px")
+        made[scale] = Made(*reduce(whole, scale // stored, recipe.background, recipe.downsampling, whole_mask))
+    return view, made
+
+
+def _stored(stored: Stored, item: Photograph, moved: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor | None]:
     """A picture of a coarse scale and its mask, as the file has them."""
-    rgba, mask = stored.rgba.to(device), None if stored.mask is None else stored.mask.to(device)
+    rgba, mask = moved(stored.rgba), None if stored.mask is None else moved(stored.mask)
     return _with_alpha_as_mask(rgba, mask) if item.alpha_is_mask else (rgba, mask)
 
 
-def _read_ahead(items: list[Photograph], scales: tuple[int, ...]) -> Iterator[dict[int, Stored]]:
+def _read_ahead(items: list[Photograph], scales: tuple[int, ...], threads: int) -> Iterator[dict[int, Stored]]:
     """What is stored of each photograph at every scale that is needed. Threads read some photographs ahead."""
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(threads, "pictures") as pool:
         ahead: deque = deque()
-        for item in items:
-            ahead.append(pool.submit(_read_files, item, scales))
-            if len(ahead) > 2 * (os.cpu_count() or 1):  # more would only wait in memory
+        try:
+            for item in items:
+                ahead.append(pool.submit(_read_files, item, scales))
+                if len(ahead) > threads:  # more would only wait in memory
+                    yield ahead.popleft().result()
+            while ahead:
                 yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _read_files(item: Photograph, scales: tuple[int, ...]) -> dict[int, Stored]:
@@ -199,67 +246,6 @@ def _read_files(item: Photograph, scales: tuple[int, ...]) -> dict[int, Stored]:
     }
 
 
-def read_mask(path: Path, width: int, height: int) -> Tensor:
-    """(H, W) uint8 of a mask for a picture of this size: 255 where it is brighter than half of its brightest pixel.
-
-    A mask of another size is scaled; pixels on its edges then count in part. Raises io.SceneError for a mask that
-    cannot be read, or that has another shape than the picture.
-    """
-    with opened_picture(path, "train") as opened:
-        levels = torch.from_numpy(np.array(opened.convert("L")))
-    own_height, own_width = levels.shape
-    if not (_is_reduced(own_width, own_height, width, height) or _is_reduced(width, height, own_width, own_height)):
-        raise io.SceneError(
-            f"{path}: expected a mask of the shape of its picture, {width} x {height} px, got {own_width} x "
-            f"{own_height}"
-        )
-    counted = 255 * (levels > levels.max() / 2).to(torch.uint8)
-    if (own_width, own_height) == (width, height):
-        return counted
-    return functional.interpolate(counted[None, None].float(), (height, width), mode="area")[0, 0].round().byte()
-
-
-def read_file(path: Path, largest: int | None = None) -> Stored:
-    """A picture and its orientation. Raises io.SceneError.
-
-    Args:
-        path: The file.
-        largest: Px of the longer side that are wanted: a .jpg is read at a half, a quarter or an eighth of its size if
-            a reduction by a whole number to no more than that begins with it. None: whole.
-    """
-    with opened_picture(path, "train") as opened:
-        if largest is not None:
-            reduction = -(-max(opened.size) // largest)
-            opened.draft(None, tuple(max(1, length // reduction) for length in opened.size))
-        if opened.mode != "F" and not opened.mode.startswith("I"):
-            return Stored(torch.from_numpy(np.array(opened.convert("RGBA"))), _orientation(opened))
-        numbers, orientation = np.array(opened).astype(np.float64), _orientation(opened)
-        peak = 1 if opened.mode == "F" else 65535
-    if not np.isfinite(numbers).all():
-        y, x = np.argwhere(~np.isfinite(numbers))[0]
-        raise io.SceneError(f"{path}: pixels must be finite, got {numbers[y, x]} at x {x}, y {y}")
-    grey = (255 * (numbers / peak).clip(0, 1)).round().astype(np.uint8)
-    return Stored(torch.from_numpy(np.stack([grey, grey, grey, np.full_like(grey, 255)], 2)), orientation)
-
-
-def read_picture(path: Path) -> Tensor:
-    """(H, W, 4) uint8 of straight alpha. Raises io.SceneError."""
-    return read_file(path).rgba
-
-
-def _orientation(opened) -> int:
-    try:
-        return opened.getexif().get(ORIENTATION, UPRIGHT)
-    except Exception:  # whatever is wrong with EXIF, the picture is good
-        return UPRIGHT
-
-
-def read_header(path: Path) -> Header:
-    """Raises io.SceneError."""
-    with opened_picture(path, "train") as opened:
-        return Header(*opened.size, _orientation(opened))
-
-
 def fitted(
     rgba: Tensor, item: Photograph, multiple: int, mask: Tensor | None = None
 ) -> tuple[io.View, Tensor, Tensor | None]:
@@ -270,22 +256,13 @@ def fitted(
 
     Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
-    path, view = item.files[1], item.view
+    path = item.files[1]
     height, width = rgba.shape[:2]
-    header = Header(width, height, UPRIGHT)
-    if not header.fits(view) and header.fits_turned(view):
-        raise io.SceneError(
-            f"{path}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x {height}"
-        )
-    x, y = width / view.width, height / view.height
-    cx, cy = (factor * middle for factor, middle in zip((x, y), view.middle))
-    view = replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=cx, cy=cy)
+    view = _view_of(item, width, height)
     rgba, mask = _with_alpha_as_mask(rgba, mask) if item.alpha_is_mask else (rgba, mask)
     if item.undistort:
-        try:
+        with naming(path):
             view, rgba, mask = _undistorted(rgba, mask, view)
-        except io.SceneError as error:
-            raise io.SceneError(f"{path}: {error}") from None
     left, top = view.width % multiple // 2, view.height % multiple // 2
     size = (view.width - view.width % multiple, view.height - view.height % multiple)
     if not all(size):
@@ -293,6 +270,19 @@ def fitted(
     view = replace(view, width=size[0], height=size[1], cx=view.cx - left, cy=view.cy - top)
     rows, columns = slice(top, top + size[1]), slice(left, left + size[0])
     return view, rgba[rows, columns], None if mask is None else mask[rows, columns]
+
+
+def _view_of(item: Photograph, width: int, height: int) -> io.View:
+    """The view of a photograph of so many px. Raises io.SceneError if it was turned after its camera was found."""
+    view, header = item.view, Header(width, height, UPRIGHT)
+    if not header.fits(view) and header.fits_turned(view):
+        raise io.SceneError(
+            f"{item.files[1]}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x "
+            f"{height}"
+        )
+    x, y = width / view.width, height / view.height
+    cx, cy = (factor * middle for factor, middle in zip((x, y), view.middle))
+    return replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=cx, cy=cy)
 
 
 def _with_alpha_as_mask(rgba: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -322,12 +312,6 @@ def _undistorted(rgba: Tensor, mask: Tensor | None, view: io.View) -> tuple[io.V
     share = masks[..., 0]
     alpha = torch.where(share > 0, 255 * seen[..., 3].float() / share, 0).clamp_max(255).round().byte()
     return pinhole, torch.cat([seen[..., :3], alpha[..., None]], 2), share
-
-
-def _is_reduced(width: int, height: int, full_width: int, full_height: int) -> bool:
-    """Whether a picture can be another with so many pixels at another scale, both sides rounded up or down."""
-    lowest = max((width - 1) / full_width, (height - 1) / full_height)
-    return lowest < min((width + 1) / full_width, (height + 1) / full_height)
 
 
 def reduce(

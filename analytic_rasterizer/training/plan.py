@@ -28,7 +28,7 @@ from .evidence import (
 )
 from .extent import outliers_of
 from .layouts import Capture, Photograph
-from .pictures import TURNED, Header, read_header
+from .photographs import TURNED, Header, read_header
 from .placement import offset_of
 
 YES, NO, NOT_KNOWN = "yes", "no", "not known"

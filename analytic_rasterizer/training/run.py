@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
@@ -45,6 +45,7 @@ from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
 from .start import capture_arguments, check_source, first_gaussians, of_length, source_of, stored_offset
+from .store import PictureMemory, described, processes_here
 from .trainer import Trainer, background_of
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ class Run:
         resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
         iterations, seconds: With `resume`: how long to train in all, where that is not what the checkpoint says.
             Schedules are computed anew; None: as in the checkpoint, with the same bits.
+        memory: How much of it pictures may take, see `PictureMemory`; the bits are the same. None: shares of what is
+            free. The test gets what the training has left of limits.
         tensorboard: Write the numbers of the log for TensorBoard too, to the folder "tensorboard" in `out`.
         chosen: Names of options that somebody chose, for whom one without effect is an error.
         ranks: The processes that train together, each with a part of the Gaussians.
@@ -108,6 +111,7 @@ class Run:
         resume: bool = False,
         iterations: int | None = None,
         seconds: float | None = None,
+        memory: PictureMemory | None = None,
         tensorboard: bool = False,
         chosen: Collection[str] = (),
         ranks: Ranks = ALONE,
@@ -116,6 +120,8 @@ class Run:
             raise ValueError(f"save_every must be at least 0, got {save_every}")
         if not resume and (iterations is not None or seconds is not None):
             raise ValueError("iterations and seconds of Run are for resume; otherwise they are among the options")
+        self.memory = (memory or PictureMemory())._replace(processes=processes_here(ranks))
+        self.memory.check(torch.device(device))  # raises before anything is read
         began = time.perf_counter()
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
@@ -144,7 +150,9 @@ class Run:
         else:
             start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
-        pictures = self._load(self.capture.train, background)
+        pictures = self._load(self.capture.train, background, self.memory)
+        if pictures.store.plan.ahead:
+            self.notes.append(described(pictures.store.plan, self.device))
         finest = pictures.colors[min(self.options.scales)]
         if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
             warnings.warn(
@@ -206,7 +214,7 @@ class Run:
         self.clock.start()
         steps = self.options.iterations if self.options.seconds == 0 else None
         display = Display(steps, self.options.seconds, progress.step, self.ranks.is_first)
-        with self._phase("steps"), interruption() as stopped, display:
+        with self._phase("steps"), interruption() as stopped, display, closing(trainer.pictures):
             ended = False
             while progress.share < 1 and not ended:
                 trainer.step()
@@ -385,7 +393,8 @@ class Run:
             with self._phase("evaluate"):
                 # A random background has no truth of its own to test against: the convention's has.
                 background = background_of(self.options, self.capture.background) or self.capture.background
-                pictures = self._load(self.capture.test, background)
+                memory = self.memory.less(self.trainer.pictures.store.plan, self.device)
+                pictures = self._load(self.capture.test, background, memory)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
                 common["color_corrected"] = self.options.exposure != "none"
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
@@ -402,12 +411,12 @@ class Run:
         self.trainer.change_length(factor)
         self.notes.append(describe_change(before, self.options, self.progress.step, self.progress.share))
 
-    def _load(self, photographs: list[Photograph], background: tuple[float, float, float] | None) -> Pictures:
+    def _load(
+        self, photographs: list[Photograph], background: tuple[float, float, float] | None, memory: PictureMemory
+    ) -> Pictures:
         """Their pictures at the scales of the training."""
         options = self.options
-        # Of several ranks each shows one in N of them: memory of the device is for Gaussians.
-        on_host = self.ranks.world > 1
-        return load_pictures(photographs, options.scales, background, self.device, options.downsampling, on_host)
+        return load_pictures(photographs, options.scales, background, self.device, options.downsampling, memory)
 
     def count(self) -> int:
         """Gaussians of all ranks."""

@@ -14,6 +14,7 @@ SH_SHARE = 0.1  # of the training, after which another degree is due at the late
 FIRST_CHANGE, CHANGE_PERIOD = 500, 100  # steps, of density control in a training that is not short
 LEAST_PERIOD = 10  # steps, whose pictures make an average
 SHORT = 7000  # steps of the shortest training that is not
+PASSES = 8  # that are known at a time: who fetches pictures looks ahead
 TOO_SHORT = 150  # steps, in fewer than which new Gaussians do not learn enough
 
 
@@ -96,14 +97,16 @@ class PictureOrder:
         self.seed = options.seed
         repeats = zip(options.scales, options.scale_repeats)
         self.pairs = [(view, scale) for scale, times in repeats for _ in range(times) for view in range(views)]
-        self.drawn = (-1, [])  # number of the pass, and its order
+        self.drawn: dict[int, list[int]] = {}  # by number of the pass, its order; those that were asked for last
 
     def __call__(self, n: int) -> tuple[int, int]:
         number, place = divmod(n, len(self.pairs))
-        if self.drawn[0] != number:
+        if number not in self.drawn:
+            if len(self.drawn) == PASSES:
+                del self.drawn[min(self.drawn)]
             generator = torch.Generator().manual_seed((self.seed << 24) + number)
-            self.drawn = number, torch.randperm(len(self.pairs), generator=generator, device="cpu").tolist()
-        return self.pairs[self.drawn[1][place]]
+            self.drawn[number] = torch.randperm(len(self.pairs), generator=generator, device="cpu").tolist()
+        return self.pairs[self.drawn[number][place]]
 
 
 def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:

@@ -232,6 +232,7 @@ class Trainer:
         """The pictures of the next step."""
         count, settings = self.options.pictures_per_step, self._settings()
         first = self.progress.step * count
+        self._expect(first)
         shown = []
         for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
@@ -243,6 +244,13 @@ class Trainer:
                 chosen = chosen._replace(effects=replace(chosen.effects or Effects(), filter_3d=self.filter_3d))
             shown.append(Shown(scale, view, chosen, background))
         return shown
+
+    def _expect(self, first: int) -> None:
+        """Has the pictures fetched that this process shows from the picture number `first` on."""
+        if self.pictures.horizon:
+            world, shown = self.ranks.world, self.stride * self.options.pictures_per_step
+            numbers = range(first + self.ranks.rank, first + shown + world * self.pictures.horizon, world)
+            self.pictures.expect(map(self.order, numbers))
 
     @torch.enable_grad()  # whatever the caller has switched off
     def _differentiate(self) -> tuple[Tensor, Tensor | None]:
