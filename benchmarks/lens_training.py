@@ -13,7 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -34,40 +36,42 @@ FISHEYE = (0.03, -0.01, 0.004, -0.001)
 STEPS = 200  # of the inversions
 
 
-def opencv_rays(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def opencv_rays(a: Tensor, b: Tensor) -> Tensor:
     """Directions (..., 3) that OpenCV's lens shows at (a, b), by fixed-point iteration."""
-    x, y = a.copy(), b.copy()
+    x, y = a, b
     for _ in range(STEPS):
         r2 = x * x + y * y
         radial = 1 + r2 * (K[0] + r2 * K[1])
         dx, dy = 2 * P[0] * x * y + P[1] * (r2 + 2 * x * x), P[0] * (r2 + 2 * y * y) + 2 * P[1] * x * y
         x, y = (a - dx) / radial, (b - dy) / radial
-    return np.stack([x, y, np.ones_like(x)], -1)
+    return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
-def fisheye_rays(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def fisheye_rays(a: Tensor, b: Tensor) -> Tensor:
     """Directions (..., 3) that OpenCV's fisheye shows at (a, b), by Newton's method."""
-    distance = np.hypot(a, b)
-    theta = distance.copy()
+    theta = distance = torch.hypot(a, b)
     powers = [(3 + 2 * k, value) for k, value in enumerate(FISHEYE)]
     for _ in range(STEPS):
         value = theta + sum(k * theta**n for n, k in powers)
         slope = 1 + sum(n * k * theta ** (n - 1) for n, k in powers)
         theta = theta - (value - distance) / slope
-    along = np.sin(theta) / np.maximum(distance, 1e-12)
-    return np.stack([a * along, b * along, np.cos(theta)], -1)
+    along = theta.sin() / distance.clamp_min(1e-12)
+    return torch.stack([a * along, b * along, theta.cos()], -1)
 
 
-def pinhole_rays(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack([a, b, np.ones_like(a)], -1)
+def pinhole_rays(a: Tensor, b: Tensor) -> Tensor:
+    return torch.stack([a, b, torch.ones_like(a)], -1)
 
 
-def rays_of(view: io.View, inverse: Callable) -> Tensor:
+@lru_cache(maxsize=1)  # most views have the same
+def rays_of(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, inverse: Callable, device: str
+) -> Tensor:
     """(FINER * height, FINER * width, 3) directions of the rays of a photograph, float32."""
-    y, x = ((np.arange(FINER * length) + 0.5) / FINER for length in (view.height, view.width))
-    cx, cy = view.middle
-    a, b = np.meshgrid((x - cx) / view.fx, (y - cy) / view.fy)
-    return torch.from_numpy(inverse(a, b)).float()
+    y, x = ((torch.arange(FINER * length, dtype=torch.float64, device=device) + 0.5) / FINER
+            for length in (height, width))  # fmt: skip
+    b, a = torch.meshgrid((y - cy) / fy, (x - cx) / fx, indexing="ij")
+    return inverse(a, b).float()
 
 
 # The camera's axes x, y, z of the faces.
@@ -93,9 +97,10 @@ class Renderer:
         self.degree, self.device, self.footprint, self.background = scene.sh_degree, device, footprint, background
 
     @torch.no_grad()
-    def photograph(self, view: io.View, rays: Tensor) -> Tensor:
-        """(3, height, width) of a camera at the pose of `view` that sees these rays."""
-        rays = rays.to(self.device)
+    def photograph(self, view: io.View, inverse: Callable) -> Tensor:
+        """(3, height, width) uint8 of a camera at the pose of `view`, whose rays `inverse` gives."""
+        intrinsics = view.width, view.height, view.fx, view.fy, *view.middle
+        rays = rays_of(*intrinsics, inverse, self.device)
         half = FINER * view.fx  # px of half a face
         side = 2 * round(half * MARGIN)
         picture = rays.new_zeros((3, *rays.shape[:2]))
@@ -113,13 +118,14 @@ class Renderer:
             at = torch.stack([x[here] / z[here], y[here] / z[here]], -1) * (2 * half / side)
             seen = torch.nn.functional.grid_sample(image[None], at[None, None], align_corners=False)[0, :, 0]
             picture[:, here] = seen
-        return torch.nn.functional.avg_pool2d(picture, FINER)
+        color = torch.nn.functional.avg_pool2d(picture, FINER).clamp(0, 1)
+        return (255 * color).round().byte().cpu()
 
 
 def write_capture(folder: Path, train: list[tuple], test: list[tuple], points: Tensor, colors: Tensor) -> None:
     """A nerfstudio capture of (view, picture, members of the frame)."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    frames = []
+    frames, pool = [], ThreadPoolExecutor()
     for view, picture, members in (*train, *test):
         c2w = torch.linalg.inv(view.w2c)
         c2w[:3, 1:3] *= -1
@@ -127,8 +133,8 @@ def write_capture(folder: Path, train: list[tuple], test: list[tuple], points: T
         size = {"w": view.width, "h": view.height, "fl_x": view.fx, "fl_y": view.fy, "cx": cx, "cy": cy}
         name = f"images/{view.name}.png"
         frames.append({"file_path": name, "transform_matrix": c2w.tolist(), **size, **members})
-        levels = (255 * picture.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
-        Image.fromarray(levels).save(folder / name)
+        pool.submit(Image.fromarray(picture.permute(1, 2, 0).numpy()).save, folder / name)
+    pool.shutdown()
     names = {f"{split}_filenames": [f"images/{item[0].name}.png" for item in items]
              for split, items in (("train", train), ("test", test))}  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps({"frames": frames, **names}))
@@ -174,9 +180,9 @@ def main() -> None:
     }
     held_out = views[::TEST_PERIOD]
     trained = [view for k, view in enumerate(views) if k % TEST_PERIOD]
-    test = [(view, renderer.photograph(view, rays_of(view, pinhole_rays)), {}) for view in held_out]
+    test = [(view, renderer.photograph(view, pinhole_rays), {}) for view in held_out]
     for name, (inverse, members) in lenses.items():
-        train = [(view, renderer.photograph(view, rays_of(view, inverse)), members) for view in trained]
+        train = [(view, renderer.photograph(view, inverse), members) for view in trained]
         write_capture(args.out / name, train, test, points, colors)
     results: dict[str, list[float]] = {}
     for name, lens in (("pinhole", "keep"), ("opencv", "keep"), ("opencv", "undistort"), ("fisheye", "keep")):

@@ -736,25 +736,25 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
 
 def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
     """Its formulas are those of the library, a photograph is the library's picture, and every training has a number."""
-    numpy = pytest.importorskip("numpy")
     pytest.importorskip("PIL.Image", reason="needs the train extra")
     program = importlib.import_module("lens_training")
-    a, b = numpy.meshgrid(numpy.linspace(-0.4, 0.4, 9), numpy.linspace(-0.3, 0.3, 7))
+    a, b = (torch.linspace(-x, x, n, dtype=torch.float64) for x, n in ((0.4, 9), (0.3, 7)))
+    a, b = torch.meshgrid(a, b, indexing="xy")
     lenses = {
         program.opencv_rays: ar.Lens.perspective(program.K, program.P),
         program.fisheye_rays: ar.Lens.fisheye(program.FISHEYE),
         program.pinhole_rays: None,
     }
     for inverse, lens in lenses.items():
-        seen = (lens or ar.Lens.perspective()).project(torch.from_numpy(inverse(a, b)).reshape(-1, 3))[0].numpy()
-        assert numpy.abs(seen - numpy.stack([a, b], -1).reshape(-1, 2)).max() < 1e-9
+        seen = (lens or ar.Lens.perspective()).project(inverse(a, b).reshape(-1, 3))[0]
+        assert (seen - torch.stack([a, b], -1).reshape(-1, 2)).abs().max() < 1e-9
     scene = importlib.import_module("scene_files").load_scene(str(small_scene / "scene.npz"))
     # Not splats that fill the picture, whose affine picture is not that of rays.
     scene.log_scales.clamp_(max=math.log(0.05))
     renderer = program.Renderer(scene, "cpu", "box:samples=4", (0.0, 0.0, 0.0))
     (view, _) = io.load_views(small_scene / "views.json")
     for inverse, lens in lenses.items():
-        made = renderer.photograph(view, program.rays_of(view, inverse))
+        made = renderer.photograph(view, inverse) / 255
         settings = dataclasses.replace(view, lens=lens).settings(sh_degree=1, footprint="box:samples=16")
         image, _ = ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())
         assert image.std() > 0.01
