@@ -14,6 +14,7 @@ import torch
 from chromium import (
     HARD,
     WEBGL_FLAGS,
+    check_photographs,
     drawn,
     facing,
     launch,
@@ -142,6 +143,10 @@ def test_eight_bits_are_a_fallback(browser):
         wait_until_ready(page)
         # Every blend rounds to a level: what the note on the page says.
         assert_same(pixels(page, view.width, view.height), rendered(scene, view, "analytic"), largest=6, rms=3)
+
+
+def test_photographs_are_beside_the_pictures_of_their_views(browser):
+    check_photographs(browser)
 
 
 def test_what_the_screen_shows_is_the_picture(browser):

@@ -13,6 +13,7 @@ import torch
 from chromium import (
     HARD,
     WEBGPU_FLAGS,
+    check_photographs,
     drawn,
     facing,
     launch,
@@ -241,6 +242,10 @@ def test_the_divider_and_the_heat_map_compare_any_two(controls):
     darkest = difference[(point == moment).all(axis=2)]
     assert len(darkest) > 0 and darkest.max() <= 32  # the first colour of the map
     assert difference.max() > 100
+
+
+def test_photographs_are_beside_the_pictures_of_their_views(browser):
+    check_photographs(browser, "?renderer=webgpu")
 
 
 def test_what_the_screen_shows_is_the_picture(browser):

@@ -8,6 +8,7 @@ from pathlib import Path
 from .. import io, viewer
 from ..footprints import resolve_footprint
 from .arguments import add_files, add_footprint, add_machine_options, add_view_options, port, use_machine
+from .photographs import find_photographs
 from .scenes import say, settle_views
 
 
@@ -67,8 +68,9 @@ def run(args) -> None:
         say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
-    with viewer.start_server(packed, args.port or 0) as server:
-        say(*said)
+    photographs, told = find_photographs(found, views)
+    with viewer.start_server(packed, args.port or 0, photographs) as server:
+        say(*said, *told)
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()

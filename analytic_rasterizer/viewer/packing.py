@@ -73,7 +73,8 @@ class PackedScene:
     Attributes:
         meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
             cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
-            and up (a unit vector). `footprints` is what the page offers: name, text for people, family (the name
+            and up (a unit vector). `photographs` are numbers of the views with a photograph: a server has them.
+            `footprints` is what the page offers: name, text for people, family (the name
             without options) and whether it is the family's default, kind (kPage of its header), samples, variance of
             its Gaussians [px^2], and the name of its option where that is another variance. `instead` is what is drawn
             while the camera moves, and where there is no WebGPU; null: the footprint itself. `compared` are names of
@@ -179,6 +180,7 @@ def pack_scene(
         "compared": [DILATED, RECOMMENDED, PAPER],
         "background": [float(value) for value in background],
         "views": [_view_entry(view) for view in views],
+        "photographs": [],
         "center": center.tolist(),
         "radius": radius,
         "up": up,

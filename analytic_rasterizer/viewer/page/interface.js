@@ -1,5 +1,7 @@
 // The controls: what the user does becomes calls of the viewer, and what the viewer shows becomes text.
 
+import { PHOTOGRAPH } from './constants.js';
+
 const element = id => document.getElementById(id);
 const DIVISORS = [1, 2, 4, 8];
 const COMPARISONS = ['off', 'split', 'difference'];
@@ -74,7 +76,8 @@ export class Interface {
       return option;
     });
     element('footprint').replaceChildren(...options());
-    element('compare').replaceChildren(new Option('nothing', ''), ...options());
+    const photographs = meta.photographs.length > 0 ? [new Option(PHOTOGRAPH, PHOTOGRAPH)] : [];
+    element('compare').replaceChildren(new Option('nothing', ''), ...photographs, ...options());
     const lacks = all.some(footprint => !renderer.draws(footprint));
     element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
       `${lacks ? ' Footprints in grey need WebGPU.' : ''}` +
@@ -241,10 +244,11 @@ export class Interface {
   /// Brings all controls in line with the state of the viewer.
   update() {
     const { footprint, compare, mode, divisor, divider } = this.viewer.state;
-    const comparing = compare !== null, split = comparing && mode === 'split';
+    const isPhotograph = compare === PHOTOGRAPH, { besidePhotograph } = this.viewer;
+    const comparing = isPhotograph ? besidePhotograph : compare !== null, split = comparing && mode === 'split';
     element('footprint').value = footprint;
     element('compare').value = compare ?? '';
-    element('compare-options').hidden = !comparing;
+    element('compare-options').hidden = compare === null;
     element('legend').hidden = !(comparing && mode === 'difference');
     for (const input of document.querySelectorAll('input[name="mode"]')) input.checked = input.value === mode;
     element('resolution').value = DIVISORS.indexOf(divisor);
@@ -261,12 +265,15 @@ export class Interface {
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
     element('label-left').textContent = this.inWords(footprint);
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
-    const given = [footprint, ...(comparing ? [compare] : [])].filter(name => this.inWords(name) !== name);
-    this.showNote(given.map(name => this.inWords(name)).join('; '));
+    const given = [footprint, ...(comparing && !isPhotograph ? [compare] : [])].filter(name => this.inWords(name) !== name);
+    const has = this.viewer.meta.photographs.includes(this.viewer.camera.view);
+    const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
+    this.showNote([...(isPhotograph && !besidePhotograph ? [missing] : []), ...given.map(name => this.inWords(name))].join('; '));
   }
 
   /// A footprint, and what is drawn for it where that is another one.
   inWords(name) {
+    if (name === PHOTOGRAPH) return `photograph of ${this.viewer.meta.views[this.viewer.camera.view].name}`;
     const drawn = this.viewer.drawn(name).name, wanted = this.viewer.footprint(name).name;
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }

@@ -36,9 +36,11 @@ export function startSorter() {
   return new Worker(url);
 }
 
-async function get(name) {
+/// What the server answers. Throws an Error with `sentence`, and what the server says.
+export async function get(name, sentence = 'The scene cannot be loaded.') {
   const response = await fetch(name).catch(() => null);
-  if (!response?.ok) throw new Error('The scene cannot be loaded. Is the command that serves it still running?');
+  if (!response) throw new Error(`${sentence} Is the command that serves it still running?`);
+  if (!response.ok) throw new Error(`${sentence} ${await response.text()}`);
   return response;
 }
 

@@ -2,9 +2,10 @@
 
 import { readAddress, writeAddress } from './address.js';
 import { Camera, add, between, depthAt, times } from './camera.js';
-import { parseFootprint } from './constants.js';
+import { PHOTOGRAPH, parseFootprint } from './constants.js';
 import { Interface, READING_TIME, announce, showFailure } from './interface.js';
 import { Pace } from './pace.js';
+import { Photographs } from './photograph.js';
 import { openRenderer } from './renderers.js';
 import { WebGLRenderer } from './webgl.js';
 
@@ -31,6 +32,7 @@ export class Viewer {
     this.losses = 0;
     this.controls = null;
     this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
+    this.photographs = new Photographs(() => this.wake());
     this.paces = new Map();
     this.settledTime = 0;  // ms
   }
@@ -152,7 +154,10 @@ export class Viewer {
     this.camera.lens = this.meta.views[k];
     this.controls.update();
     announce(`View ${this.meta.views[k].name}`, READING_TIME);
-    this.travel(this.camera.poseOfView(k), () => { this.atView = true; });
+    this.travel(this.camera.poseOfView(k), () => {
+      this.atView = true;
+      this.controls.update();
+    });
   }
 
   /// Moves to a pose, at once for people who prefer no motion.
@@ -201,7 +206,10 @@ export class Viewer {
 
   moved(onJourney = false) {
     if (!onJourney) this.journey = null;
-    this.atView = false;
+    if (this.atView) {
+      this.atView = false;
+      this.controls.update();
+    }
     this.movedAt = performance.now();
     this.wake();
     this.restLater();
@@ -225,6 +233,11 @@ export class Viewer {
   get size() {
     const ratio = window.devicePixelRatio || 1, { clientWidth, clientHeight } = this.surface;
     return [clientWidth, clientHeight].map(side => Math.max(1, Math.round(side * ratio)));
+  }
+
+  /// Whether a photograph is to be compared with, and can be: the camera is where it was taken.
+  get besidePhotograph() {
+    return this.state.compare === PHOTOGRAPH && this.atView && this.meta.photographs.includes(this.camera.view);
   }
 
   /// The camera of the canvas, at a resolution 1/divisor of it.
@@ -281,7 +294,8 @@ export class Viewer {
   /// when it begins to. False if there is no picture.
   async drawFrame() {
     const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
-    const left = this.drawn(footprint, moving), right = compare === null ? null : this.drawn(compare, moving);
+    const left = this.drawn(footprint, moving);
+    const right = [null, PHOTOGRAPH].includes(compare) ? null : this.drawn(compare, moving);
     const pace = moving ? this.paceOf(left, right) : null;
     const camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
     const split = right !== null && mode === 'split', column = Math.ceil(divider * camera.width);
@@ -295,7 +309,9 @@ export class Viewer {
     const took = performance.now() - start;
     if (moving) pace.note(took);
     else this.settledTime = took;
-    this.shown = { left: 'left', right: right === null ? null : 'right', camera, moving };
+    const photograph = this.besidePhotograph && this.photographs.place(this.renderer, camera, this.camera);
+    const beside = photograph ? PHOTOGRAPH : null;
+    this.shown = { left: 'left', right: right === null ? beside : 'right', camera, moving };
     this.present();
     return true;
   }

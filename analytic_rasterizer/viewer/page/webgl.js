@@ -7,7 +7,7 @@ import { Projection } from './webgl_project.js';
 import {
   FULL_SCREEN, GL_KINDS, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
 } from './webgl_shaders.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture } from './webgl_tools.js';
+import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
 
 // Above so many Gaussians the order is rough while the camera moves.
 const ROUGH_ORDER_FROM = 200000;
@@ -119,6 +119,15 @@ export class WebGLRenderer {
     const made = { width, height, format, texture, framebuffer: createFramebuffer(gl, [texture]) };
     this.pictures.set(name, made);
     return made;
+  }
+
+  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
+  put(name, { width, height }, values) {
+    const { gl } = this, format = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
+    gl.deleteTexture(this.pictures.get(name)?.texture ?? null);
+    const texture = createTexture(gl, width, height, format);
+    fillTexture(gl, texture, width, format, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
+    this.pictures.set(name, { width, height, texture });
   }
 
   /// Draws pictures, each {name, footprint, span}, of which the columns from span[0] on up to span[1] are needed [px];

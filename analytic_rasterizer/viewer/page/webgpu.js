@@ -116,6 +116,11 @@ export class WebGPURenderer {
     return made;
   }
 
+  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
+  put(name, size, values) {
+    this.device.queue.writeBuffer(this.picture(name, size).buffer, 0, values);
+  }
+
   async drawRegion(picture, camera, footprint, region, cancelled) {
     const { device, passes } = this, [, top, , bottom] = region, rows = bottom - top;
     for (;;) {
