@@ -4,6 +4,7 @@ Skipped where chromium or playwright is missing (`make test-browser` installs bo
 software.
 """
 
+import re
 from dataclasses import replace
 from io import BytesIO
 
@@ -242,6 +243,18 @@ def test_the_divider_and_the_heat_map_compare_any_two(controls):
     darkest = difference[(point == moment).all(axis=2)]
     assert len(darkest) > 0 and darkest.max() <= 32  # the first colour of the map
     assert difference.max() > 100
+
+
+def test_the_times_of_passes_are_shown_where_the_device_tells_them(controls):
+    settle(controls)
+    told = controls.evaluate("async () => (await navigator.gpu.requestAdapter()).features.has('timestamp-query')")
+    if not told:
+        assert controls.text_content("#stages") == ""
+        pytest.skip("this device has no timestamps")
+    text = controls.text_content("#stages")
+    names = ("project", "sort", "bin", "sort tiles", "blend")
+    assert re.fullmatch(", ".join(rf"{name} (\d+\.\d)" for name in names) + " ms", text)
+    assert sum(float(time) for time in re.findall(r"\d+\.\d", text)) > 0
 
 
 def test_photographs_are_beside_the_pictures_of_their_views(browser):

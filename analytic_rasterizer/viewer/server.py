@@ -25,9 +25,7 @@ class ViewerServer(http.server.ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(
-        self, scene: PackedScene, port: int = 0, photographs: Mapping[int, Callable[[], bytes]] | None = None
-    ):
+    def __init__(self, scene: PackedScene, port: int = 0, photographs: Mapping[int, Callable[[], bytes]] | None = None):
         """Binds to a port.
 
         Args:

@@ -278,8 +278,11 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows how fast frames are, and how large. `rate` is null where the camera rests.
-  showFigures(width, height, milliseconds, rate) {
+  /// Shows how fast frames are, and how large. `rate` is null where the camera rests. `stages` are milliseconds by name,
+  /// where the device tells.
+  showFigures(width, height, milliseconds, rate, stages) {
+    const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
+    element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
     element('figures').textContent = `${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
   }

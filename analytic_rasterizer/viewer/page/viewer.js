@@ -339,7 +339,7 @@ export class Viewer {
       this.rate = this.rate === null ? rate : 0.8 * this.rate + 0.2 * rate;
     }
     this.lastDrawn = active ? now : null;
-    this.controls.showFigures(width, height, now - start, this.rate);
+    this.controls.showFigures(width, height, now - start, this.rate, this.renderer.stages ?? {});
   }
 
   /// Whether an error was that the device is lost, which may be told a little later.

@@ -4,7 +4,7 @@ import { KINDS, sampling } from './footprint.wgsl.js';
 import { TILE, frameData } from './frame.wgsl.js';
 import { SCREEN_BYTES, present, screenData } from './present.wgsl.js';
 import { harmonicNumbers } from './sh.js';
-import { Passes, largestBinding, tilesOf } from './webgpu_passes.js';
+import { Passes, STAGES, largestBinding, tilesOf } from './webgpu_passes.js';
 
 const BAND_TIME = 250;   // ms that the device may blend at a stretch: systems end what seems to hang
 const FIRST_BANDS = 8;   // of a picture, as long as nothing has been measured
@@ -28,7 +28,8 @@ export class WebGPURenderer {
     // Where the default of 128 MiB is enough, none is asked for.
     const requiredLimits = needed <= 2 ** 27 ? {}
       : { maxStorageBufferBindingSize: most, maxBufferSize: adapter.limits.maxBufferSize };
-    const device = await adapter.requestDevice({ requiredLimits });
+    const requiredFeatures = ['timestamp-query'].filter(feature => adapter.features.has(feature));
+    const device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
     const context = canvas.getContext('webgpu');
     if (!context) throw new Error('WebGPU cannot draw into the page.');
     return new WebGPURenderer(canvas, context, device, fullDifference);
@@ -40,6 +41,7 @@ export class WebGPURenderer {
     this.pictures = new Map();
     this.rate = null;    // ms for a sample of a pair
     this.pairs = null;   // of the last picture
+    this.stages = {};    // ms of the last frame, where the device tells
     this.turn = Promise.resolve();
     this.isLost = false;
     this.lost = device.lost.then(() => { this.isLost = true; });
@@ -54,7 +56,7 @@ export class WebGPURenderer {
     });
     const { UNIFORM, COPY_DST, MAP_READ } = GPUBufferUsage;
     this.screen = device.createBuffer({ size: SCREEN_BYTES, usage: UNIFORM | COPY_DST });
-    this.numbers = device.createBuffer({ size: 16, usage: MAP_READ | COPY_DST });
+    this.numbers = device.createBuffer({ size: 16 + 16 * STAGES.length, usage: MAP_READ | COPY_DST });
   }
 
   /// Throws an Error with a sentence where the device has no room.
@@ -86,6 +88,7 @@ export class WebGPURenderer {
   }
 
   async drawNow({ camera, pictures, cancelled = () => false }) {
+    this.stages = {};
     for (const { name, footprint, span = [0, camera.width] } of pictures) {
       const picture = this.picture(name, camera), [, rows] = tilesOf(camera);
       const region = [Math.floor(span[0] / TILE), 0, Math.ceil(span[1] / TILE), rows];
@@ -134,9 +137,10 @@ export class WebGPURenderer {
       encoder.clearBuffer(picture.ranges);
       passes.encode(encoder, bands === 1 ? [...steps, blended(top, rows)] : steps);
       encoder.copyBufferToBuffer(passes.counts, 0, this.numbers, 0, 16);
+      passes.stamp(encoder, this.numbers, 16);
       device.queue.submit([encoder.finish()]);
       await this.numbers.mapAsync(GPUMapMode.READ);
-      const [, , , wanted] = new Uint32Array(this.numbers.getMappedRange().slice(0));
+      const numbers = this.numbers.getMappedRange().slice(0), wanted = new Uint32Array(numbers)[3];
       this.numbers.unmap();
       this.complain();
       if (wanted > passes.room) {  // what was blended has holes
@@ -147,6 +151,7 @@ export class WebGPURenderer {
           && await this.drawRegion(picture, camera, footprint, [left, middle, right, bottom], cancelled);
       }
       this.pairs = wanted;
+      if (passes.queries) this.noteStages(new BigUint64Array(numbers, 16), bands === 1 ? STAGES : STAGES.slice(0, -1));
       if (bands === 1) this.measure(footprint, performance.now() - start, wanted);
       return bands === 1 || await this.blendInBands(blended, footprint, top, bottom, bands, cancelled);
     }
@@ -168,6 +173,12 @@ export class WebGPURenderer {
     return Math.min(Math.max(Math.ceil(wanted), 1), rows);
   }
 
+  noteStages(stamps, stages) {
+    for (const [k, stage] of stages.entries()) {
+      this.stages[stage] = (this.stages[stage] ?? 0) + Number(stamps[2 * k + 1] - stamps[2 * k]) / 1e6;
+    }
+  }
+
   measure(footprint, milliseconds, pairs) {
     this.rate = milliseconds / (Math.max(pairs, 1) * footprint.samples);
   }
@@ -181,7 +192,9 @@ export class WebGPURenderer {
       this.device.queue.submit([encoder.finish()]);
       await this.device.queue.onSubmittedWorkDone();
     }
-    this.measure(footprint, performance.now() - start, this.pairs);
+    const took = performance.now() - start;
+    this.measure(footprint, took, this.pairs);
+    if (this.passes.queries) this.stages.blend = (this.stages.blend ?? 0) + took;
     return true;
   }
 

@@ -1,5 +1,5 @@
 // The passes of a picture with WebGPU: their buffers, pipelines and order. Default limits are enough for all of them: at
-// most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. No feature that is optional is used.
+// most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. Timestamps are an optional feature: they are shown.
 
 import {
   COUNT_VISIBLE, RANGES, SCAN_APPLY, SCAN_BLOCK, SCAN_BLOCKS, SCAN_REDUCE, emit,
@@ -15,6 +15,8 @@ const SPLAT_BYTES = 48;
 const FIRST_ROOM = 65536;       // pairs, at least
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
 const VISIBLE_SORT = 0, VISIBLE_SCAN = 16, VISIBLE_EMIT = 32, PAIRS_SORT = 48;
+
+export const STAGES = ['project', 'sort', 'bin', 'sort tiles', 'blend'];  // of a picture, in this order
 
 /// Bytes of the largest binding that a scene needs.
 export const largestBinding = (count, degree) => count * Math.max(SPLAT_BYTES, 2 * harmonicNumbers(degree));
@@ -76,6 +78,10 @@ export class Passes {
     this.arguments = this.buffer(64, null, GPUBufferUsage.INDIRECT);
     this.totals = this.buffer(64);
     this.frame = this.uniform(FRAME_BYTES);
+    if (device.features.has('timestamp-query')) {
+      this.queries = device.createQuerySet({ type: 'timestamp', count: 2 * STAGES.length });
+      this.stamps = this.buffer(16 * STAGES.length, null, GPUBufferUsage.QUERY_RESOLVE);
+    }
     this.reserve(Math.max(2 * n, FIRST_ROOM));
   }
 
@@ -124,20 +130,21 @@ export class Passes {
 
   /// Steps of a stable sort by `bits`. `source` is the place of their number in counts. [keys, values] are pairs of
   /// buffers; the result is in the first ones.
-  *sort(keys, values, bits, source, offset, drops) {
+  *sort(stage, keys, values, bits, source, offset, drops) {
     for (let shift = 0; shift < bits; shift += SORT_BITS) {
       const first = drops && shift === 0, uniform = this.constant(shift, first ? 0 : source, first ? 1 : 0, 0);
       const size = first ? [Math.ceil(this.count / SORT_BLOCK)] : this.indirect(offset);
       const { counts, histogram, totals } = this;
-      yield { key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
-      yield { key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
+      yield { stage, key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
+      yield { stage, key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
         size: [2 ** SORT_BITS] };
-      yield { key: 'sort scatter', code: () => SORT_SCATTER,
+      yield { stage, key: 'sort scatter', code: () => SORT_SCATTER,
         buffers: [uniform, counts, keys[0], values[0], keys[1], values[1], histogram, totals], size };
       keys.reverse();
       values.reverse();
       if (first) {
-        yield { key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments], size: [1] };
+        yield { stage, key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments],
+          size: [1] };
       }
     }
   }
@@ -149,32 +156,47 @@ export class Passes {
     const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
     const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
     const steps = [
-      { key: `project ${kind} ${degree}`, code: () => project(kind, degree),
+      { stage: 'project', key: `project ${kind} ${degree}`, code: () => project(kind, degree),
         buffers: [frame, this.geometry, this.harmonics, splats, depths[0], tiles],
         size: [across, Math.ceil(groups / across)] },
-      ...this.sort(depths, order, 32, 1, VISIBLE_SORT, true),
-      { key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
+      ...this.sort('sort', depths, order, 32, 1, VISIBLE_SORT, true),
+      { stage: 'bin', key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
         size: this.indirect(VISIBLE_SCAN) },
-      { key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments], size: [1] },
-      { key: 'scan apply', code: () => SCAN_APPLY, buffers: [counts, order[0], tiles, blocks, offsets],
+      { stage: 'bin', key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments],
+        size: [1] },
+      { stage: 'bin', key: 'scan apply', code: () => SCAN_APPLY, buffers: [counts, order[0], tiles, blocks, offsets],
         size: this.indirect(VISIBLE_SCAN) },
-      { key: `emit ${kind}`, code: () => emit(kind),
+      { stage: 'bin', key: `emit ${kind}`, code: () => emit(kind),
         buffers: [frame, counts, order[0], offsets, tiles, splats, pairKeys[0], pairs[0]],
         size: this.indirect(VISIBLE_EMIT) },
-      ...this.sort(pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
-      { key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges], size: this.indirect(PAIRS_SORT) },
+      ...this.sort('sort tiles', pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
+      { stage: 'sort tiles', key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges],
+        size: this.indirect(PAIRS_SORT) },
     ];
     const blended = (first, number) => ({
-      key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
+      stage: 'blend', key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
       buffers: [frame, this.constant(first, 0, 0, 0), ranges, pairs[0], splats, picture], size: [width, number],
     });
     return { steps, blended };
   }
 
+  /// Each stage is a pass of its own, for the timestamps of its begin and end.
   encode(encoder, steps) {
-    const pass = encoder.beginComputePass();
-    for (const step of steps) this.pipelines.encode(pass, step);
-    pass.end();
+    for (const [k, stage] of STAGES.entries()) {
+      const own = steps.filter(step => step.stage === stage), { queries: querySet } = this;
+      if (own.length === 0) continue;
+      const pass = encoder.beginComputePass(querySet &&
+        { timestampWrites: { querySet, beginningOfPassWriteIndex: 2 * k, endOfPassWriteIndex: 2 * k + 1 } });
+      for (const step of own) this.pipelines.encode(pass, step);
+      pass.end();
+    }
+  }
+
+  /// Copies the timestamps into a buffer.
+  stamp(encoder, buffer, at) {
+    if (!this.queries) return;
+    encoder.resolveQuerySet(this.queries, 0, 2 * STAGES.length, this.stamps, 0);
+    encoder.copyBufferToBuffer(this.stamps, 0, buffer, at, 16 * STAGES.length);
   }
 }
 
