@@ -29,6 +29,9 @@ def add_parser(subcommands) -> None:
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
     )
     parser.add_argument(
+        "--compact", action="store_true", help="half of the memory: harmonics of 8 bits, for browsers with WebGPU only"
+    )
+    parser.add_argument(
         "--server",
         action="store_true",
         help="render every frame here, by the library's own kernels, and not in the browser; needs the extra 'view'",
@@ -61,6 +64,7 @@ def run(args) -> None:
         reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
     views, said = settle_views(args, found, required=False)
     options = {"footprint": footprint, "background": args.background, "name": found.path.name}
+    options["compact"] = args.compact
     packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
     said.append(f"footprint {footprint}: {reason}")
     if args.export is not None:
@@ -82,6 +86,8 @@ def run_live(args) -> None:
     """Renders for browsers until interrupted."""
     if args.export is not None:
         raise ValueError("--export writes the page that needs no server: leave out --server")
+    if args.compact:
+        raise ValueError("--compact is for the memory of the browser: leave out --server")
     given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)

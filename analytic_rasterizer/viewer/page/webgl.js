@@ -50,6 +50,7 @@ export class WebGLRenderer {
     const gl = canvas.getContext('webgl2', {
       antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance',
     });
+    if (meta.compact) throw new Error('Compact scenes need WebGPU, which does not draw here: leave out --compact.');
     if (!gl) throw new Error('This viewer needs WebGPU or WebGL 2, which this browser or this machine does not offer.');
     if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < 4096) throw new Error('This viewer needs textures of 4096 pixels.');
     return new WebGLRenderer(canvas, gl, bits, fullDifference);

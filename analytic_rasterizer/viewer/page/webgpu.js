@@ -3,7 +3,7 @@
 import { KINDS, sampling } from './footprint.wgsl.js';
 import { TILE, frameData } from './frame.wgsl.js';
 import { SCREEN_BYTES, present, screenData } from './present.wgsl.js';
-import { harmonicNumbers } from './sh.js';
+import { sceneBytes } from './sh.js';
 import { Passes, STAGES, largestBinding, tilesOf } from './webgpu_passes.js';
 
 const BAND_TIME = 250;   // ms that the device may blend at a stretch: systems end what seems to hang
@@ -18,12 +18,13 @@ export class WebGPURenderer {
     if (!adapter) throw new Error('WebGPU finds no graphics device here.');
     const inSoftware = adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter ?? false;
     if (inSoftware && !software) throw new Error('WebGPU would have no graphics device here.');
-    const { count, sh_degree: degree } = meta, needed = largestBinding(count, degree);
+    const needed = largestBinding(meta);
     const { maxStorageBufferBindingSize: most } = adapter.limits;
     if (needed > most) {
-      const fits = Math.floor(most / largestBinding(1, degree));
-      throw new Error(`the scene has ${count.toLocaleString('en')} Gaussians, and WebGPU on this device can hold ` +
-        `${fits.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
+      const fit = form => Math.floor(most / largestBinding({ ...form, count: 1 })).toLocaleString('en');
+      throw new Error(`the scene has ${meta.count.toLocaleString('en')} Gaussians, and WebGPU on this device can hold ` +
+        `${fit(meta)} of spherical harmonics of degree ${meta.sh_degree}` +
+        `${meta.compact ? '.' : `, or ${fit({ ...meta, compact: 1 })} with --compact.`}`);
     }
     // Where the default of 128 MiB is enough, none is asked for.
     const requiredLimits = needed <= 2 ** 27 ? {}
@@ -62,7 +63,7 @@ export class WebGPURenderer {
   /// Throws an Error with a sentence where the device has no room.
   async load(scene) {
     if (!await this.fits(() => { this.passes = new Passes(this.device, scene); })) {
-      const { count, sh_degree: degree } = scene.meta, bytes = count * (120 + 2 * harmonicNumbers(degree));
+      const [geometry, harmonics] = sceneBytes(scene.meta), bytes = scene.meta.count * (72 + geometry + harmonics);
       throw new Error(`The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its ` +
         'memory.');
     }

@@ -7,7 +7,7 @@ import {
 import { blend } from './blend.wgsl.js';
 import { FRAME_BYTES, TILE, WORKGROUP } from './frame.wgsl.js';
 import { project } from './project.wgsl.js';
-import { harmonicNumbers } from './sh.js';
+import { sceneBytes } from './sh.js';
 import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './sort.wgsl.js';
 
 const MOST_WORKGROUPS = 65535;  // along one direction
@@ -19,7 +19,7 @@ const VISIBLE_SORT = 0, VISIBLE_SCAN = 16, VISIBLE_EMIT = 32, PAIRS_SORT = 48;
 export const STAGES = ['project', 'sort', 'bin', 'sort tiles', 'blend'];  // of a picture, in this order
 
 /// Bytes of the largest binding that a scene needs.
-export const largestBinding = (count, degree) => count * Math.max(SPLAT_BYTES, 2 * harmonicNumbers(degree));
+export const largestBinding = meta => meta.count * Math.max(SPLAT_BYTES, ...sceneBytes(meta));
 
 /// Pipelines and bind groups, each made once.
 class Pipelines {
@@ -57,16 +57,16 @@ class Pipelines {
 
 export class Passes {
   /// Uploads the scene, which loadScene returned.
-  constructor(device, { meta, geometry, harmonics }) {
+  constructor(device, { meta, geometry, harmonics, packed = geometry }) {
     this.device = device;
     this.pipelines = new Pipelines(device);
     this.count = meta.count;
-    this.degree = meta.sh_degree;
+    this.meta = meta;
     this.numbered = 0;
     this.uniforms = new Map();
     this.room = 0;
     const n = this.count, words = 4 * n;
-    this.geometry = this.buffer(geometry.byteLength, geometry);
+    this.geometry = this.buffer(packed.byteLength, packed);
     this.harmonics = this.buffer(harmonics.byteLength, harmonics);
     this.splats = this.buffer(SPLAT_BYTES * n);
     this.depths = [this.buffer(words), this.buffer(words)];
@@ -152,11 +152,11 @@ export class Passes {
   /// The steps that fill the lists of a picture with this many columns and rows of tiles, and then
   /// `blended(first row, rows)`, a step that draws some of its rows.
   steps(footprint, [columns, rows], width, ranges, picture) {
-    const { counts, tiles, offsets, blocks, splats, frame, degree } = this, { kind } = footprint;
+    const { counts, tiles, offsets, blocks, splats, frame } = this, { kind } = footprint;
     const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
     const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
     const steps = [
-      { stage: 'project', key: `project ${kind} ${degree}`, code: () => project(kind, degree),
+      { stage: 'project', key: `project ${kind}`, code: () => project(kind, this.meta),
         buffers: [frame, this.geometry, this.harmonics, splats, depths[0], tiles],
         size: [across, Math.ceil(groups / across)] },
       ...this.sort('sort', depths, order, 32, 1, VISIBLE_SORT, true),
