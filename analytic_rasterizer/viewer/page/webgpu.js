@@ -63,7 +63,7 @@ export class WebGPURenderer {
   /// Throws an Error with a sentence where the device has no room.
   async load(scene) {
     if (!await this.fits(() => { this.passes = new Passes(this.device, scene); })) {
-      const [geometry, harmonics] = sceneBytes(scene.meta), bytes = scene.meta.count * (72 + geometry + harmonics);
+      const [geometry, harmonics] = sceneBytes(scene.meta), bytes = scene.meta.count * (68 + geometry + harmonics);
       throw new Error(`The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its ` +
         'memory.');
     }

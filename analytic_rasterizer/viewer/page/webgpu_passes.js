@@ -1,9 +1,7 @@
 // The passes of a picture with WebGPU: their buffers, pipelines and order. Default limits are enough for all of them: at
 // most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. Timestamps are an optional feature: they are shown.
 
-import {
-  COUNT_VISIBLE, RANGES, SCAN_APPLY, SCAN_BLOCK, SCAN_BLOCKS, SCAN_REDUCE, emit,
-} from './bin.wgsl.js';
+import { COUNT_VISIBLE, RANGES, SCAN_BLOCKS, SCAN_REDUCE, emit } from './bin.wgsl.js';
 import { blend } from './blend.wgsl.js';
 import { FRAME_BYTES, TILE, WORKGROUP } from './frame.wgsl.js';
 import { project } from './project.wgsl.js';
@@ -14,7 +12,7 @@ const MOST_WORKGROUPS = 65535;  // along one direction
 const SPLAT_BYTES = 48;
 const FIRST_ROOM = 65536;       // pairs, at least
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
-const VISIBLE_SORT = 0, VISIBLE_SCAN = 16, VISIBLE_EMIT = 32, PAIRS_SORT = 48;
+const VISIBLE_SORT = 0, VISIBLE_EMIT = 16, PAIRS_SORT = 32;
 
 export const STAGES = ['project', 'sort', 'bin', 'sort tiles', 'blend'];  // of a picture, in this order
 
@@ -72,10 +70,9 @@ export class Passes {
     this.depths = [this.buffer(words), this.buffer(words)];
     this.order = [this.buffer(words), this.buffer(words)];
     this.tiles = this.buffer(words);
-    this.offsets = this.buffer(words);
-    this.blocks = this.buffer(4 * (Math.ceil(n / SCAN_BLOCK) + 1));
+    this.blocks = this.buffer(4 * (Math.ceil(n / WORKGROUP) + 1));
     this.counts = this.buffer(16, new Uint32Array([n, 0, 0, 0]));
-    this.arguments = this.buffer(64, null, GPUBufferUsage.INDIRECT);
+    this.arguments = this.buffer(48, null, GPUBufferUsage.INDIRECT);
     this.totals = this.buffer(64);
     this.frame = this.uniform(FRAME_BYTES);
     if (device.features.has('timestamp-query')) {
@@ -152,7 +149,7 @@ export class Passes {
   /// The steps that fill the lists of a picture with this many columns and rows of tiles, and then
   /// `blended(first row, rows)`, a step that draws some of its rows.
   steps(footprint, [columns, rows], width, ranges, picture) {
-    const { counts, tiles, offsets, blocks, splats, frame } = this, { kind } = footprint;
+    const { counts, tiles, blocks, splats, frame } = this, { kind } = footprint;
     const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
     const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
     const steps = [
@@ -161,13 +158,11 @@ export class Passes {
         size: [across, Math.ceil(groups / across)] },
       ...this.sort('sort', depths, order, 32, 1, VISIBLE_SORT, true),
       { stage: 'bin', key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
-        size: this.indirect(VISIBLE_SCAN) },
+        size: this.indirect(VISIBLE_EMIT) },
       { stage: 'bin', key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments],
         size: [1] },
-      { stage: 'bin', key: 'scan apply', code: () => SCAN_APPLY, buffers: [counts, order[0], tiles, blocks, offsets],
-        size: this.indirect(VISIBLE_SCAN) },
       { stage: 'bin', key: `emit ${kind}`, code: () => emit(kind),
-        buffers: [frame, counts, order[0], offsets, tiles, splats, pairKeys[0], pairs[0]],
+        buffers: [frame, counts, order[0], blocks, tiles, splats, pairKeys[0], pairs[0]],
         size: this.indirect(VISIBLE_EMIT) },
       ...this.sort('sort tiles', pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
       { stage: 'sort tiles', key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges],
