@@ -626,41 +626,28 @@ def test_axe_finds_nothing(controls, state):
     assert [(v["id"], [node["html"] for node in v["nodes"]]) for v in found] == []
 
 
-def test_bench_times_every_footprint(browser):
-    with serve(random_scene(100), [facing()]) as server, open_page(browser, f"{server.url}?bench=3&size=32x24") as page:
-        wait_until_ready(page)
-        found = page.evaluate("() => analyticBench")
-    assert (found["rounds"], found["width"], found["height"], found["count"]) == (3, 32, 24, 100)
-    assert set(found["ms"]) == set(WEBGL_FOOTPRINTS)
-    assert all(len(times) == 3 and min(times) > 0 for times in found["ms"].values())
-
-
 def test_the_order_is_that_of_a_stable_sort(browser):
     depths = np.random.default_rng(0).choice(np.linspace(0.1, 50, 997), 20000).astype(np.float32)
     means = np.zeros((20000, 12), np.float32)
     means[:, 2] = depths
     with serve(random_scene(10), [facing()]) as server, open_page(browser, server.url) as page:
         wait_for_frame(page)
-        script = """async ([text, exact]) => {
+        script = """async text => {
           const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
           const worker = new Worker('sort.js');
           worker.postMessage({ means: new Float32Array(bytes.buffer), stride: 12, count: 20000 });
           const answer = await new Promise(resolve => {
             worker.onmessage = ({ data }) => resolve(data);
-            worker.postMessage({ row: Float32Array.of(0, 0, 1, 0), near: 0.2, exact });
+            worker.postMessage({ row: Float32Array.of(0, 0, 1, 0), near: 0.2 });
           });
           worker.terminate();
           return [...answer.order];
         }"""
         text = base64.b64encode(means.tobytes()).decode()
-        exact, rough = (np.array(page.evaluate(script, [text, exact])) for exact in (True, False))
+        order = np.array(page.evaluate(script, text))
     expected = np.argsort(depths, kind="stable")
     expected = expected[depths[expected] > np.float32(0.2)][::-1]
-    np.testing.assert_array_equal(exact, expected)
-    np.testing.assert_array_equal(np.sort(rough), np.sort(expected))
-    # A step of the rough order is 1/65536 of the bits between nearest and farthest, less than 1/2000 of a depth.
-    behind = depths[rough]
-    assert (behind[1:] <= behind[:-1] * (1 + 1 / 2000)).all()
+    np.testing.assert_array_equal(order, expected)
 
 
 # ---------------------------------------------------------------------------------- live viewer

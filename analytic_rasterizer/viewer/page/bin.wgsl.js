@@ -73,7 +73,7 @@ fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: v
   if (t == ${WORKGROUP - 1}u) { blocks[block.x] = all; }
 }`;
 
-/// Sums over them; the number of pairs, and workgroups for them. Sums end at 2^32 - 1, far beyond what there is room for.
+/// Sums over them; the number of pairs, and workgroups for them. Sums end at 2^32 - 1, beyond what there is room for.
 export const SCAN_BLOCKS = `${FRAME}${GROUP_SCAN}
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read_write> counts: array<u32>;

@@ -265,10 +265,11 @@ export class Interface {
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
     element('label-left').textContent = this.inWords(footprint);
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
-    const given = [footprint, ...(comparing && !isPhotograph ? [compare] : [])].filter(name => this.inWords(name) !== name);
+    const names = comparing && !isPhotograph ? [footprint, compare] : [footprint];
+    const given = names.map(name => this.inWords(name)).filter((words, k) => words !== names[k]);
     const has = this.viewer.meta.photographs.includes(this.viewer.camera.view);
     const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
-    this.showNote([...(isPhotograph && !besidePhotograph ? [missing] : []), ...given.map(name => this.inWords(name))].join('; '));
+    this.showNote([...(isPhotograph && !besidePhotograph ? [missing] : []), ...given].join('; '));
   }
 
   /// A footprint, and what is drawn for it where that is another one.

@@ -30,8 +30,8 @@ export class Photographs {
     this.placed = {};
   }
 
-  /// Brings the photograph of the camera's view into the renderer, as the picture PHOTOGRAPH of this pinhole. False while
-  /// it is not here.
+  /// Brings the photograph of the camera's view into the renderer, as the picture PHOTOGRAPH of this pinhole. False
+  /// while it is not here.
   place(renderer, pinhole, { view, lens }) {
     if (this.asked.view !== view) {
       const asked = this.asked = { view, bitmap: null };
@@ -40,7 +40,8 @@ export class Photographs {
         this.loaded();
       }).catch(error => announce(error.message, READING_TIME));
     }
-    const { bitmap } = this.asked, { width, height, fx, cx, cy } = pinhole, key = [view, width, height, fx, cx, cy].join();
+    const { bitmap } = this.asked, { width, height, fx, cx, cy } = pinhole;
+    const key = [view, width, height, fx, cx, cy].join();
     if (bitmap && (this.placed.renderer !== renderer || this.placed.key !== key)) {
       renderer.put(PHOTOGRAPH, pinhole, asPicture(bitmap, pinhole, lens));
       this.placed = { renderer, key };

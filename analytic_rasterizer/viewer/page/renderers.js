@@ -3,7 +3,7 @@
 //   create(canvas, meta, options)   of the class; before the scene is there
 //   load(scene)
 //   draws(footprint)                whether it can draw an entry of `footprints` of the scene
-//   draw({camera, pictures, settled, cancelled}), put(name, size, values), present(...), read(name, background)
+//   draw({camera, pictures, settled, cancelled}), put(name, size, values), present(...), read(name)
 //   isLost; `lost` resolves when the device is lost, `returned` when it can be had again
 //   dispose()
 

@@ -294,24 +294,22 @@ export class Viewer {
   /// when it begins to. False if there is no picture.
   async drawFrame() {
     const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
-    const left = this.drawn(footprint, moving);
-    const right = [null, PHOTOGRAPH].includes(compare) ? null : this.drawn(compare, moving);
+    const left = this.drawn(footprint, moving), alone = compare === null || compare === PHOTOGRAPH;
+    const right = alone ? null : this.drawn(compare, moving);
     const pace = moving ? this.paceOf(left, right) : null;
     const camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
     const split = right !== null && mode === 'split', column = Math.ceil(divider * camera.width);
-    const pictures = [{ name: 'left', footprint: left, span: split ? [0, column] : undefined }];
-    if (right !== null) {
-      const span = split ? [Math.max(column - 1, 0), camera.width] : undefined;
-      pictures.push({ name: 'right', footprint: right, span });
-    }
+    const span = part => (split ? part : undefined), rest = span([Math.max(column - 1, 0), camera.width]);
+    const pictures = [{ name: 'left', footprint: left, span: span([0, column]) }];
+    if (right !== null) pictures.push({ name: 'right', footprint: right, span: rest });
     const start = performance.now(), cancelled = () => !moving && this.moving;
     if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
     const took = performance.now() - start;
     if (moving) pace.note(took);
     else this.settledTime = took;
-    const photograph = this.besidePhotograph && this.photographs.place(this.renderer, camera, this.camera);
-    const beside = photograph ? PHOTOGRAPH : null;
-    this.shown = { left: 'left', right: right === null ? beside : 'right', camera, moving };
+    let beside = right === null ? null : 'right';
+    if (this.besidePhotograph && this.photographs.place(this.renderer, camera, this.camera)) beside = PHOTOGRAPH;
+    this.shown = { left: 'left', right: beside, camera, moving };
     this.present();
     return true;
   }

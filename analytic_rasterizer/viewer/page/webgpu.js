@@ -219,27 +219,19 @@ export class WebGPURenderer {
     device.queue.submit([encoder.finish()]);
   }
 
-  /// The picture over the background as the rasterizer orders it: (3, height, width), not clamped.
-  async read(name, background) {
+  /// Colour and transmittance of a picture: four numbers a pixel. Rejects where there is none.
+  async read(name) {
     const picture = this.pictures.get(name);
     if (!picture || this.isLost) throw new Error('There is no picture: the graphics device was lost since.');
-    const { MAP_READ, COPY_DST } = GPUBufferUsage, pixels = picture.width * picture.height, { size } = picture.buffer;
+    const { MAP_READ, COPY_DST } = GPUBufferUsage, { size } = picture.buffer;
     const staging = this.device.createBuffer({ size, usage: MAP_READ | COPY_DST });
     const encoder = this.device.createCommandEncoder();
     encoder.copyBufferToBuffer(picture.buffer, 0, staging, 0, size);
     this.device.queue.submit([encoder.finish()]);
     await staging.mapAsync(GPUMapMode.READ);
-    const values = new Float32Array(staging.getMappedRange().slice(0)), planes = new Float32Array(3 * pixels);
+    const values = new Float32Array(staging.getMappedRange().slice(0));
     staging.destroy();
-    for (let p = 0; p < pixels; ++p) {
-      for (let c = 0; c < 3; ++c) planes[c * pixels + p] = values[4 * p + c] + values[4 * p + 3] * background[c];
-    }
-    return planes;
-  }
-
-  /// What draws, in the words of the system.
-  describe() {
-    return this.name;
+    return values;
   }
 
   dispose() {

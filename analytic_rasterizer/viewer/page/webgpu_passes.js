@@ -10,7 +10,7 @@ import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './so
 
 const MOST_WORKGROUPS = 65535;  // along one direction
 const SPLAT_BYTES = 48;
-const FIRST_ROOM = 65536;       // pairs, at least
+const FIRST_ROOM = 65536;       // pairs, until it is known how many there are
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
 const VISIBLE_SORT = 0, VISIBLE_EMIT = 16, PAIRS_SORT = 32;
 
@@ -79,7 +79,7 @@ export class Passes {
       this.queries = device.createQuerySet({ type: 'timestamp', count: 2 * STAGES.length });
       this.stamps = this.buffer(16 * STAGES.length, null, GPUBufferUsage.QUERY_RESOLVE);
     }
-    this.reserve(Math.max(2 * n, FIRST_ROOM));
+    this.reserve(FIRST_ROOM);
   }
 
   buffer(bytes, data = null, usage = 0) {
