@@ -254,6 +254,8 @@ def test_a_scene_too_large_for_the_device_is_a_sentence(browser):
         assert page.inner_text("#message") == (
             "The scene has 20 Gaussians; this device can hold 12 of spherical harmonics of degree 3."
         )
+        loaded = page.evaluate("() => performance.getEntriesByType('resource').map(({ name }) => name)")
+        assert any("scene.json" in name for name in loaded) and not any("geometry.bin" in name for name in loaded)
 
 
 def test_a_server_that_is_gone_is_a_sentence(browser):

@@ -173,9 +173,18 @@ def test_compact_scenes(browser, degree):
 
 
 def test_compact_scenes_need_webgpu(browser):
-    with serve(random_scene(10), [facing()], compact=True) as server, open_page(browser, server.url) as page:
-        wait_for(page, "() => window.analyticError")
-        assert page.inner_text("#message").startswith("Compact scenes need WebGPU")
+    init = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => 560 })"
+    would = "A compact scene needs WebGPU. WebGL 2 would draw: "
+    with serve(random_scene(11), [facing()], compact=True) as server:
+        with open_page(browser, f"{server.url}?renderer=webgl") as page:
+            wait_for(page, "() => window.analyticError")
+            assert page.inner_text("#message") == f"{would}the address asks for it."
+        with open_gpu(browser, server, init=init) as page:
+            wait_for(page, "() => window.analyticError")
+            assert page.inner_text("#message") == (
+                f"{would}the scene has 11 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics of "
+                "degree 3."
+            )
 
 
 def test_a_compact_scene_has_places_to_focus_on(browser):

@@ -33,5 +33,6 @@ export async function openRenderer(meta, wish, bits) {
       reason = error.message;
     }
   }
+  if (meta.compact) throw new Error(`A compact scene needs WebGPU. WebGL 2 would draw: ${reason}`);
   return { renderer: await WebGLRenderer.create(freshCanvas(), meta, options), reason };
 }

@@ -3,7 +3,7 @@
 
 import { CONSTANTS } from './constants.js';
 import { startSorter } from './load.js';
-import { Projection } from './webgl_project.js';
+import { Projection, largestCount } from './webgl_project.js';
 import {
   FULL_SCREEN, GL_KINDS, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
 } from './webgl_shaders.js';
@@ -48,9 +48,13 @@ export class WebGLRenderer {
     const gl = canvas.getContext('webgl2', {
       antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance',
     });
-    if (meta.compact) throw new Error('Compact scenes need WebGPU, which does not draw here: leave out --compact.');
     if (!gl) throw new Error('This viewer needs WebGPU or WebGL 2, which this browser or this machine does not offer.');
     if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < 4096) throw new Error('This viewer needs textures of 4096 pixels.');
+    const { count, sh_degree: degree } = meta, most = largestCount(gl.getParameter(gl.MAX_TEXTURE_SIZE), degree);
+    if (count > most) {
+      throw new Error(`The scene has ${count.toLocaleString('en')} Gaussians; this device can hold ` +
+        `${most.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
+    }
     return new WebGLRenderer(canvas, gl, bits, fullDifference);
   }
 
