@@ -40,6 +40,7 @@ from pages import (
     turned_view,
 )
 
+import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import io, viewer
 from analytic_rasterizer.gaussians import Gaussians
@@ -387,6 +388,15 @@ def test_views(controls):
 
 
 @pytest.mark.gate
+def test_the_page_says_where_a_view_is_shown_without_its_lens(browser):
+    views = [facing(), replace(turned_view(), lens=ar.Lens.fisheye((0.05,)))]
+    with serve(random_scene(50), views) as server, open_page(browser, server.url, reduced_motion="reduce") as page:
+        wait_for_frame(page)
+        assert page.is_hidden("#note")
+        page.keyboard.press(".")
+        assert page.text_content("#note") == "This view is shown without its lens."
+
+
 def test_the_mouse_turns_moves_and_zooms(controls):
     def drag(button="left"):
         controls.mouse.move(300, 40)

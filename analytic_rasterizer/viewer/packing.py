@@ -72,10 +72,10 @@ class PackedScene:
 
     Attributes:
         meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
-            cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
-            and up (a unit vector). `compact` is null, or the unit of the scales of a compact scene; `photographs` are
-            the numbers of views with a photograph, which a server has. `footprints` is what the page offers: name, text
-            for people, family (the name without options) and whether it is the family's default, kind (kPage of its
+            cy in pixels, the 16 numbers of w2c by rows, and whether it has a lens), center and radius (of most of the
+            Gaussians, world units), and up (a unit vector). `compact` is null, or the unit of the scales of a compact
+            scene; `photographs` are the numbers of views with a photograph, which a server has. `footprints` is what the
+            page offers: name, text for people, family (the name without options) and whether it is the family's default, kind (kPage of its
             header), samples, variance of its Gaussians [px^2], and the name of its option where that is another
             variance. `instead` is what is drawn while the camera moves, and where there is no WebGPU; null: the
             footprint itself. `compared` are names of footprints that the key C compares with: the first that can be
@@ -277,8 +277,7 @@ def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch
 
 def _view_entry(view: io.View) -> dict:
     entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
-    if view.lens is not None:
-        entry["name"] += " (without its lens)"  # the page has pinholes
+    entry["lens"] = view.lens is not None  # the page has pinholes, and says so
     entry["cx"], entry["cy"] = view.middle
     return entry | {"w2c": view.w2c.flatten().tolist()}
 

@@ -267,9 +267,10 @@ export class Interface {
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
     const names = comparing && !isPhotograph ? [footprint, compare] : [footprint];
     const given = names.map(name => this.inWords(name)).filter((words, k) => words !== names[k]);
-    const has = this.viewer.meta.photographs.includes(this.viewer.camera.view);
+    const { view, lens } = this.viewer.camera, has = this.viewer.meta.photographs.includes(view);
     const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
-    this.showNote([...(isPhotograph && !besidePhotograph ? [missing] : []), ...given].join('; '));
+    const notes = [...(isPhotograph && !besidePhotograph ? [missing] : []), given.join('; ')];
+    this.showNote([...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ').trim());
   }
 
   /// A footprint, and what is drawn for it where that is another one.
