@@ -71,15 +71,15 @@ class PackedScene:
     """What the page needs of a scene.
 
     Attributes:
-        meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
-            cy in pixels, the 16 numbers of w2c by rows, and whether it has a lens), center and radius (of most of the
+        meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx, cy
+            in pixels, the 16 numbers of w2c by rows, and whether it has a lens), center and radius (of most of the
             Gaussians, world units), and up (a unit vector). `compact` is null, or the unit of the scales of a compact
-            scene; `photographs` are the numbers of views with a photograph, which a server has. `footprints` is what the
-            page offers: name, text for people, family (the name without options) and whether it is the family's default, kind (kPage of its
-            header), samples, variance of its Gaussians [px^2], and the name of its option where that is another
-            variance. `instead` is what is drawn while the camera moves, and where there is no WebGPU; null: the
-            footprint itself. `compared` are names of footprints that the key C compares with: the first that can be
-            drawn and is not chosen.
+            scene; `photographs` are the numbers of views with a photograph, which a server has. `footprints` is what
+            the page offers: name, text for people, family (the name without options) and whether it is the family's
+            default, kind (kPage of its header), samples, variance of its Gaussians [px^2], and the name of its option
+            where that is another variance. `instead` is what is drawn while the camera moves, and where there is no
+            WebGPU; null: the footprint itself. `compared` are names of footprints that the key C compares with: the
+            first that can be drawn and is not chosen.
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
