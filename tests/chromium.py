@@ -6,11 +6,12 @@ import os
 import shutil
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pytest
 import torch
-from pages import PATIENCE, READ_PIXELS, random_scene, turned_view
+from pages import PATIENCE, READ_PIXELS, random_scene, rendered, serve, turned_view
 
 from analytic_rasterizer import io
 
@@ -47,9 +48,9 @@ def launch(flags):
 
 
 @contextmanager
-def open_page(browser, url, *, offline=False, init=None, **options):
-    """A page of its own context. Fails for anything that the page complains of in its console."""
-    context = browser.new_context(viewport={"width": 320, "height": 240}, offline=offline, **options)
+def open_page(browser, url, *, offline=False, init=None, size=(320, 240), **options):
+    """A page of its own context, of a size [px]. Fails for anything that the page complains of in its console."""
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, offline=offline, **options)
     context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     complaints = []
@@ -100,6 +101,48 @@ def settle(page):
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
     wait_for(page, "() => document.getElementById('surface').getAttribute('aria-busy') === 'false'")
     return page.screenshot(type="png")
+
+
+def check_photographs(browser, query=""):
+    """A photograph is beside the picture of its view, where the view reaches, and the heat map shows the difference."""
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+    scene, view = random_scene(300), replace(facing(), width=320, height=240, fx=300.0, fy=300.0)
+    taken = rendered(scene, view, "point")
+    taken[:, 60:120, 160:] = 1.0  # a part that the scene has not
+    file = BytesIO()
+    io.to_image(torch.from_numpy(taken)).save(file, "PNG")
+
+    def picture(page):
+        return np.asarray(image.open(BytesIO(settle(page))).convert("RGB")).astype(int)[50:122]  # not covered
+
+    with (
+        serve(scene, [view, turned_view()], {0: file.getvalue}, footprint="point") as server,
+        open_page(browser, f"{server.url}{query}", reduced_motion="reduce", size=(480, 240)) as page,
+    ):
+        wait_for_frame(page)
+        page.keyboard.press("h")
+        alone = picture(page)
+        page.select_option("#compare", "photograph", force=True)
+        assert page.text_content("#label-right") == "photograph of facing"
+        for _ in range(100):  # until it is loaded
+            both = picture(page)
+            if both[12:68, 255:396].min() == 255:
+                break
+            page.wait_for_timeout(50)
+        # The page is 80 columns wider than the view on both sides.
+        for columns in (slice(0, 230), slice(404, 480)):
+            assert (both[:, columns] == alone[:, columns]).all()
+        assert both[12:68, 255:396].min() == 255
+        page.keyboard.press("c")
+        heat = picture(page)
+        assert heat[12:68, 250:396].min() > 150 and heat[:, :236].max() <= 32 and heat[:, 404:].max() <= 32
+        page.keyboard.press("ArrowLeft")  # elsewhere there is no photograph
+        moved = picture(page)
+        assert (moved[12:68, 255:396] < 255).any() and "R goes there" in page.text_content("#note")
+        page.keyboard.press("r")
+        assert (picture(page) == heat).all() and page.text_content("#note") == ""
+        page.select_option("#view", "1", force=True)
+        assert "R goes there" not in page.text_content("#note")
 
 
 # ------------------------------------------------------------------------------------- scenes

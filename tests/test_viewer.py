@@ -9,15 +9,19 @@ import re
 import shutil
 import subprocess
 import threading
+from io import BytesIO
 
 import numpy as np
 import pytest
 import torch
+from capture_files import circle, write_colmap, write_pictures
 from conftest import ROOT
+from pages import serve
 from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer
+from analytic_rasterizer.cli.photographs import find_photographs
 from analytic_rasterizer.footprints import footprint_variants
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import pages
@@ -242,6 +246,19 @@ def test_the_server_serves_page_and_scene(server):
     assert (status, body) == (200, server.files[""][0])
 
 
+def test_photographs_are_read_when_they_are_asked_for():
+    def missing():
+        raise OSError("gone")
+
+    with serve(make_scene(), [make_view("a"), make_view("b")], {1: lambda: b"picture", 0: missing}) as server:
+        path = f"/{server.token}"
+        assert json.loads(ask(server, f"{path}/scene.json")[2])["photographs"] == [0, 1]
+        status, headers, body = ask(server, f"{path}/photographs/1")
+        assert (status, headers["Content-Type"], body) == (200, "image/png", b"picture")
+        assert ask(server, f"{path}/photographs/0")[::2] == (500, b"gone\n")
+        assert ask(server, f"{path}/photographs/2")[0] == 404
+
+
 def test_head_has_no_body(server):
     status, headers, body = ask(server, f"/{server.token}/geometry.bin", method="HEAD")
     assert (status, body) == (200, b"")
@@ -387,6 +404,32 @@ def test_the_command_shows_what_is_near_to_what_the_page_cannot_draw(files, caps
     assert '"footprint": "cumulant"' in (files / "out.html").read_text(encoding="utf-8")
     expected = "footprint cumulant: the page cannot draw exact (exact.ply says so), and this is near"
     assert capsys.readouterr().err == f"{expected}; --server shows it\n"
+
+
+def test_a_training_knows_the_photographs_of_its_views(tmp_path):
+    pytest.importorskip("scipy", reason="needs the train extra")
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+    data, out = tmp_path / "data", tmp_path / "out"
+    cameras = circle(4)
+    write_colmap(data / "sparse" / "0", cameras, torch.randn(9, 3), torch.zeros(9, 3, dtype=torch.int32))
+    (data / "images").mkdir()
+    write_pictures(data / "images", cameras, opaque=True)
+    arguments = ["--iterations", "1", "--scales", "2,4", "--test-every", "0", "--device", "cpu"]
+    assert cli.main(["train", str(data), "--out", str(out), *arguments]) == 0
+
+    found = io.find_scene(out)
+    views = [*found.load_views(), make_view("elsewhere")]
+    photographs, said = find_photographs(found, views)
+    assert said == [f"4 photographs of {data} to compare with"] and sorted(photographs) == [0, 1, 2, 3]
+    for k, view in enumerate(views[:4]):
+        shown = np.asarray(image.open(BytesIO(photographs[k]())))
+        with image.open(data / "images" / f"{view.name}.png") as stored:
+            assert np.abs(shown - np.asarray(stored.convert("RGB").reduce(2), dtype=float)).max() <= 1
+    assert shown.shape == (view.height, view.width, 3)
+
+    data.rename(tmp_path / "moved")
+    photographs, (said,) = find_photographs(found, views)
+    assert photographs == {} and said == f"no photographs: {data}: no such folder"
 
 
 def test_the_background_is_that_of_the_file(files):

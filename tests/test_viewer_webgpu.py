@@ -4,6 +4,7 @@ Skipped where chromium or playwright is missing (`make test-browser` installs bo
 software.
 """
 
+import re
 from dataclasses import replace
 from io import BytesIO
 
@@ -13,6 +14,7 @@ import torch
 from chromium import (
     HARD,
     WEBGPU_FLAGS,
+    check_photographs,
     drawn,
     facing,
     launch,
@@ -27,6 +29,7 @@ from pages import assert_same, random_scene, rendered, serve, turned_view
 
 import demo
 from analytic_rasterizer import viewer
+from analytic_rasterizer.gaussians import Gaussians
 
 ADAPTER = "async () => (await navigator.gpu?.requestAdapter())?.info.isFallbackAdapter ?? null"
 DEVICES = """
@@ -126,6 +129,74 @@ def test_pairs_beyond_the_room_lose_no_picture(browser, most):
         assert np.array_equal(first, drawn(page, "box:samples=1", view.width, view.height))
 
 
+def unpacked(scene):
+    """A scene as a compact one tells it."""
+    packed = viewer.pack_scene(scene, compact=True)
+    geometry = np.frombuffer(packed.geometry, "<u4").reshape(-1, 6).copy()
+    assert np.array_equal(geometry[:, :3].view("f4"), scene.means.numpy())
+    halves, turn = geometry[:, 3:5].copy().view("f2").astype("f4"), geometry[:, 5]
+    largest, rows = (turn >> 30).astype(int), np.arange(len(turn))
+    others = np.stack([turn >> 10 * k & 1023 for k in range(3)], 1) / 511 - 1
+    quaternions = np.zeros((len(turn), 4))
+    for k in range(3):
+        quaternions[rows, (largest + 1 + k) % 4] = others[:, k] * 0.5**0.5
+    quaternions[rows, largest] = np.sqrt(1 - (quaternions**2).sum(1))
+    bytes_ = np.frombuffer(packed.harmonics, "u1").reshape(len(turn), -1)
+    first = bytes_[:, :8].copy().view("<f2").astype("f4")
+    used = 3 * ((scene.sh_degree + 1) ** 2 - 1)
+    rest = bytes_[:, 8 : 8 + used].view("i1") / 127 * first[:, 3:]
+    shs = torch.from_numpy(np.concatenate([first[:, :3], rest], 1)).float().reshape(len(turn), -1, 3)
+    return Gaussians.from_activated(
+        scene.means,
+        torch.from_numpy(halves[:, :3] * packed.meta["compact"]),
+        torch.from_numpy(quaternions).float(),
+        torch.from_numpy(halves[:, 3:]),
+        shs,
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_compact_scenes(browser, degree):
+    scene, view = random_scene(500, degree=degree), small(turned_view())
+    told = unpacked(scene)
+    for name, atol in {"scales": 1e-4, "opacities": 1e-3, "shs": 2e-3}.items():
+        assert torch.allclose(getattr(told, name), getattr(scene, name), atol=atol, rtol=1e-3), name
+    turned = (told.rotations * torch.nn.functional.normalize(scene.rotations)).sum(1).abs()
+    assert turned.min() > np.cos(0.003)  # radians of half of the angle
+    with (
+        serve(scene, [view], compact=True) as server,
+        open_gpu(browser, server, "&view=0&size=16x16") as page,
+    ):
+        wait_until_ready(page)
+        picture = drawn(page, "moment:samples=4", view.width, view.height)
+    assert_same(picture, rendered(told, view, "moment:samples=4"))
+
+
+def test_compact_scenes_need_webgpu(browser):
+    init = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => 560 })"
+    would = "A compact scene needs WebGPU. WebGL 2 would draw: "
+    with serve(random_scene(11), [facing()], compact=True) as server:
+        with open_page(browser, f"{server.url}?renderer=webgl") as page:
+            wait_for(page, "() => window.analyticError")
+            assert page.inner_text("#message") == f"{would}the address asks for it."
+        with open_gpu(browser, server, init=init) as page:
+            wait_for(page, "() => window.analyticError")
+            assert page.inner_text("#message") == (
+                f"{would}the scene has 11 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics of "
+                "degree 3."
+            )
+
+
+def test_a_compact_scene_has_places_to_focus_on(browser):
+    with (
+        serve(random_scene(300), [facing()], compact=True) as server,
+        open_gpu(browser, server, reduced_motion="reduce") as page,
+    ):
+        wait_for_frame(page)
+        page.mouse.dblclick(200, 60)
+        wait_for(page, "() => location.hash.includes('camera=')")
+
+
 # ----------------------------------------------------------------------------- which renderer
 
 
@@ -135,7 +206,7 @@ def test_a_scene_that_is_too_large_for_webgpu_is_drawn_without(browser):
         wait_for_frame(page)
         expected = (
             "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics "
-            "of degree 3. Footprints in grey need WebGPU."
+            "of degree 3, or 17 with --compact. Footprints in grey need WebGPU."
         )
         assert page.text_content("#renderer") == expected
 
@@ -241,6 +312,22 @@ def test_the_divider_and_the_heat_map_compare_any_two(controls):
     darkest = difference[(point == moment).all(axis=2)]
     assert len(darkest) > 0 and darkest.max() <= 32  # the first colour of the map
     assert difference.max() > 100
+
+
+def test_the_times_of_passes_are_shown_where_the_device_tells_them(controls):
+    settle(controls)
+    told = controls.evaluate("async () => (await navigator.gpu.requestAdapter()).features.has('timestamp-query')")
+    if not told:
+        assert controls.text_content("#stages") == ""
+        pytest.skip("this device has no timestamps")
+    text = controls.text_content("#stages")
+    names = ("project", "sort", "bin", "sort tiles", "blend")
+    assert re.fullmatch(", ".join(rf"{name} (\d+\.\d)" for name in names) + " ms", text)
+    assert sum(float(time) for time in re.findall(r"\d+\.\d", text)) > 0
+
+
+def test_photographs_are_beside_the_pictures_of_their_views(browser):
+    check_photographs(browser, "?renderer=webgpu")
 
 
 def test_what_the_screen_shows_is_the_picture(browser):

@@ -8,6 +8,7 @@ from pathlib import Path
 from .. import io, viewer
 from ..footprints import resolve_footprint
 from .arguments import add_files, add_footprint, add_machine_options, add_view_options, port, use_machine
+from .photographs import find_photographs
 from .scenes import say, settle_views
 
 
@@ -26,6 +27,9 @@ def add_parser(subcommands) -> None:
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
     parser.add_argument(
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
+    )
+    parser.add_argument(
+        "--compact", action="store_true", help="half of the memory: harmonics of 8 bits, for browsers with WebGPU only"
     )
     parser.add_argument(
         "--server",
@@ -60,6 +64,7 @@ def run(args) -> None:
         reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
     views, said = settle_views(args, found, required=False)
     options = {"footprint": footprint, "background": args.background, "name": found.path.name}
+    options["compact"] = args.compact
     packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
     said.append(f"footprint {footprint}: {reason}")
     if args.export is not None:
@@ -67,8 +72,9 @@ def run(args) -> None:
         say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
-    with viewer.start_server(packed, args.port or 0) as server:
-        say(*said)
+    photographs, told = find_photographs(found, views)
+    with viewer.start_server(packed, args.port or 0, photographs) as server:
+        say(*said, *told)
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()
@@ -80,6 +86,8 @@ def run_live(args) -> None:
     """Renders for browsers until interrupted."""
     if args.export is not None:
         raise ValueError("--export writes the page that needs no server: leave out --server")
+    if args.compact:
+        raise ValueError("--compact is for the memory of the browser: leave out --server")
     given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)

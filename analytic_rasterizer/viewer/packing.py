@@ -23,6 +23,7 @@ from ..footprints import (
     stated,
 )
 from ..gaussians import Gaussians
+from .compact import LARGEST_HALF, compact_geometry, compact_harmonics
 
 MOVING = "moving"
 """kPage of footprints whose samples move."""
@@ -53,7 +54,6 @@ PAGE_FOOTPRINTS = tuple(entry["name"] for entry in PAGE_ENTRIES)
 MAX_SH_DEGREE = 3
 GEOMETRY_WIDTH = 12
 """Numbers of a Gaussian in `PackedScene.geometry`."""
-LARGEST_HALF = 65504.0
 Z_IS_UP = 3.0
 """How much more than y, in what faces it and in flatness together, the axis z must have to be up; see `upright`."""
 PICTURE = 0.95
@@ -71,17 +71,21 @@ class PackedScene:
     """What the page needs of a scene.
 
     Attributes:
-        meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
-            cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
-            and up (a unit vector). `footprints` is what the page offers: name, text for people, family (the name
-            without options) and whether it is the family's default, kind (kPage of its header), samples, variance of
-            its Gaussians [px^2], and the name of its option where that is another variance. `instead` is what is drawn
-            while the camera moves, and where there is no WebGPU; null: the footprint itself. `compared` are names of
-            footprints that the key C compares with: the first that can be drawn and is not chosen.
+        meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx, cy
+            in pixels, the 16 numbers of w2c by rows, and whether it has a lens), center and radius (of most of the
+            Gaussians, world units), and up (a unit vector). `compact` is null, or the unit of the scales of a compact
+            scene; `photographs` are the numbers of views with a photograph, which a server has. `footprints` is what
+            the page offers: name, text for people, family (the name without options) and whether it is the family's
+            default, kind (kPage of its header), samples, variance of its Gaussians [px^2], and the name of its option
+            where that is another variance. `instead` is what is drawn while the camera moves, and where there is no
+            WebGPU; null: the footprint itself. `compared` are names of footprints that the key C compares with: the
+            first that can be drawn and is not chosen.
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
             filled up with zeros to a multiple of four numbers.
+
+    Both are smaller where the scene is compact; see `compact.py`.
     """
 
     meta: dict
@@ -128,6 +132,7 @@ def pack_scene(
     name: str = "scene",
     footprint: str | None = None,
     background=(0.0, 0.0, 0.0),
+    compact: bool = False,
 ) -> PackedScene:
     """Brings a scene into the form that the page reads.
 
@@ -137,6 +142,7 @@ def pack_scene(
         name: What the page calls the scene.
         footprint: One of `PAGE_FOOTPRINTS`; None takes the library's default.
         background: (r, g, b) in [0, 1].
+        compact: Half of the memory, for WebGPU only: harmonics of 8 bits, rotations of 10.
 
     Raises:
         ValueError: A scene without Gaussians or with numbers that are not finite, harmonics beyond degree 3, or a
@@ -154,15 +160,12 @@ def pack_scene(
             raise ValueError(f"{name}: {field} must be finite")
 
     scene = scene.to("cpu")
-    geometry = torch.zeros(count, GEOMETRY_WIDTH, dtype=torch.float32, device="cpu")
-    geometry[:, 0:3] = scene.means
-    geometry[:, 3:4] = scene.opacities
-    geometry[:, 4:7] = scene.scales
-    geometry[:, 8:12] = _unit_quaternions(scene.rotations)
-
-    used = 3 * (scene.sh_degree + 1) ** 2
-    harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16, device="cpu")
-    harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
+    unit = None
+    if compact:
+        geometry, unit = compact_geometry(scene, _unit_quaternions(scene.rotations))
+        harmonics = compact_harmonics(scene)
+    else:
+        geometry, harmonics = _geometry(scene), _harmonics(scene)
 
     center, radius = extent(scene)
     if views:
@@ -174,16 +177,34 @@ def pack_scene(
         "name": name,
         "count": count,
         "sh_degree": scene.sh_degree,
+        "compact": unit,
         "footprint": chosen_name,
         "footprints": list(PAGE_ENTRIES),
         "compared": [DILATED, RECOMMENDED, PAPER],
         "background": [float(value) for value in background],
         "views": [_view_entry(view) for view in views],
+        "photographs": [],
         "center": center.tolist(),
         "radius": radius,
         "up": up,
     }
-    return PackedScene(meta, geometry.numpy().astype("<f4").tobytes(), harmonics.numpy().astype("<f2").tobytes())
+    return PackedScene(meta, geometry, harmonics)
+
+
+def _geometry(scene: Gaussians) -> bytes:
+    geometry = torch.zeros(len(scene.means), GEOMETRY_WIDTH, dtype=torch.float32, device="cpu")
+    geometry[:, 0:3] = scene.means
+    geometry[:, 3:4] = scene.opacities
+    geometry[:, 4:7] = scene.scales
+    geometry[:, 8:12] = _unit_quaternions(scene.rotations)
+    return geometry.numpy().astype("<f4").tobytes()
+
+
+def _harmonics(scene: Gaussians) -> bytes:
+    count, used = len(scene.means), 3 * (scene.sh_degree + 1) ** 2
+    harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16, device="cpu")
+    harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
+    return harmonics.numpy().astype("<f2").tobytes()
 
 
 def _unit_quaternions(rotations: torch.Tensor) -> torch.Tensor:
@@ -256,8 +277,7 @@ def overview(center: torch.Tensor, radius: float, up: torch.Tensor, ahead: torch
 
 def _view_entry(view: io.View) -> dict:
     entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
-    if view.lens is not None:
-        entry["name"] += " (without its lens)"  # the page has pinholes
+    entry["lens"] = view.lens is not None  # the page has pinholes, and says so
     entry["cx"], entry["cy"] = view.middle
     return entry | {"w2c": view.w2c.flatten().tolist()}
 

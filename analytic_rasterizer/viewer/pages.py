@@ -24,6 +24,7 @@ MODULES = (
     "renderers.js",
     "camera.js",
     "interface.js",
+    "photograph.js",
     "address.js",
     "pace.js",
     "viewer.js",

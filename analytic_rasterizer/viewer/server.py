@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import http.server
+import json
 import secrets
+from collections.abc import Callable, Mapping
 
 from .packing import PackedScene
 from .pages import content_security_policy, served_files
@@ -13,7 +15,7 @@ CHUNK = 1 << 20
 
 
 class ViewerServer(http.server.ThreadingHTTPServer):
-    """Serves a fixed set of files from memory, under a random path, on 127.0.0.1 only.
+    """Serves a fixed set of files and photographs, under a random path, on 127.0.0.1 only.
 
     Attributes:
         url: Where the page is.
@@ -23,39 +25,47 @@ class ViewerServer(http.server.ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, scene: PackedScene, port: int = 0):
+    def __init__(self, scene: PackedScene, port: int = 0, photographs: Mapping[int, Callable[[], bytes]] | None = None):
         """Binds to a port.
 
         Args:
             scene: What `pack_scene` returned.
             port: 0 takes any free port.
+            photographs: By the number of their view, functions that return the PNG of a photograph.
 
         Raises:
             OSError: The port cannot be had.
         """
         super().__init__((ADDRESS, port), _Handler)
         self.token = secrets.token_urlsafe(24)
-        self.files = served_files() | {
-            "scene.json": (scene.meta_json(), "application/json"),
+        photographs = photographs or {}
+        meta = scene.meta | {"photographs": sorted(photographs)}
+        self.files: dict[str, tuple[bytes | Callable[[], bytes], str]] = served_files() | {
+            "scene.json": (json.dumps(meta, allow_nan=False).encode(), "application/json"),
             "geometry.bin": (scene.geometry, "application/octet-stream"),
             "harmonics.bin": (scene.harmonics, "application/octet-stream"),
         }
+        self.files |= {f"photographs/{k}": (read, "image/png") for k, read in photographs.items()}
         self.files[""] = self.files["index.html"]
         self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
 
 
-def start_server(scene: PackedScene, port: int = 0) -> ViewerServer:
+def start_server(
+    scene: PackedScene, port: int = 0, photographs: Mapping[int, Callable[[], bytes]] | None = None
+) -> ViewerServer:
     """A server that is bound, and answers as soon as its `serve_forever` runs.
 
     Args:
         scene: What `pack_scene` returned.
         port: 0 takes any free port.
+        photographs: By the number of their view, functions that return the PNG of a photograph. They may raise OSError
+            or ValueError, which the page shows.
 
     Raises:
         ValueError: The port cannot be used.
     """
     try:
-        return ViewerServer(scene, port)
+        return ViewerServer(scene, port, photographs)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ValueError(f"port {port} cannot be used: {reason}") from None
@@ -92,6 +102,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._refuse(404, "There is no such file.")
             return
         content, kind = self.server.files[name]
+        if callable(content):
+            try:
+                content = content()
+            except (OSError, ValueError) as error:
+                self._refuse(500, str(error))
+                return
         self._send(200, content, kind, with_body)
 
     def _refuse(self, status: int, reason: str) -> None:

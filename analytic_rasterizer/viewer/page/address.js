@@ -1,6 +1,7 @@
 // The state of the viewer in the address of the page, after the #, so that it can be saved and sent.
 
 import { Camera } from './camera.js';
+import { PHOTOGRAPH } from './constants.js';
 import { hexOf, rgbOf } from './interface.js';
 
 /// Takes pose, footprints, resolution and background from the address, where it has them.
@@ -19,7 +20,8 @@ export function readAddress(viewer) {
     viewer.atView = true;
   }
   if (valid(given.get('footprint'))) state.footprint = given.get('footprint');
-  state.compare = valid(given.get('compare')) ? given.get('compare') : null;
+  const compare = given.get('compare');
+  state.compare = valid(compare) || (compare === PHOTOGRAPH && meta.photographs.length > 0) ? compare : null;
   if (['split', 'difference'].includes(given.get('mode'))) state.mode = given.get('mode');
   if (['1', '2', '4', '8'].includes(given.get('reduce'))) state.divisor = Number(given.get('reduce'));
   if (/^[0-9a-f]{6}$/.test(given.get('background') ?? '')) state.background = rgbOf(`#${given.get('background')}`);

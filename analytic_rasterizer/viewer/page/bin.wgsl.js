@@ -3,10 +3,8 @@
 
 import { FRAME, TILE, WORKGROUP } from './frame.wgsl.js';
 import { KINDS } from './footprint.wgsl.js';
-import { GROUP_SCAN, SORT_BLOCK } from './sort.wgsl.js';
+import { GROUP_SCAN, SORT_BLOCK, scanOf } from './sort.wgsl.js';
 
-const SCAN_ITEMS = 8;
-export const SCAN_BLOCK = WORKGROUP * SCAN_ITEMS;  // numbers that a workgroup adds up
 // A splat in more tiles than these is written by a whole workgroup.
 const LARGE = 32;
 
@@ -57,12 +55,10 @@ fn main() {
   for (var d = 0u; d < 16u; d++) { n += totals[d]; }
   counts[1] = n;
   arguments[0] = (n + ${SORT_BLOCK - 1}u) / ${SORT_BLOCK}u; arguments[1] = 1u; arguments[2] = 1u;   // sort
-  arguments[4] = (n + ${SCAN_BLOCK - 1}u) / ${SCAN_BLOCK}u; arguments[5] = 1u; arguments[6] = 1u;   // scan
-  arguments[8] = (n + ${WORKGROUP - 1}u) / ${WORKGROUP}u; arguments[9] = 1u; arguments[10] = 1u;    // emit
+  arguments[4] = (n + ${WORKGROUP - 1}u) / ${WORKGROUP}u; arguments[5] = 1u; arguments[6] = 1u;     // emit
 }`;
 
-// Sums of the numbers of tiles before each visible splat: of blocks, over blocks, within blocks.
-
+/// How many tiles the visible splats of each workgroup of emit have.
 export const SCAN_REDUCE = `${GROUP_SCAN}
 @group(0) @binding(0) var<storage, read> counts: array<u32>;
 @group(0) @binding(1) var<storage, read> order: array<u32>;
@@ -70,16 +66,14 @@ export const SCAN_REDUCE = `${GROUP_SCAN}
 @group(0) @binding(3) var<storage, read_write> blocks: array<u32>;
 @compute @workgroup_size(${WORKGROUP})
 fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
-  var sum = 0u;
-  for (var k = 0u; k < ${SCAN_ITEMS}u; k++) {
-    let at = block.x * ${SCAN_BLOCK}u + k * ${WORKGROUP}u + t;
-    if (at < counts[1]) { sum = saturated(sum, tiles[order[at]]); }
-  }
-  let all = inclusive(t, sum);
+  let at = block.x * ${WORKGROUP}u + t;
+  var x = 0u;
+  if (at < counts[1]) { x = tiles[order[at]]; }
+  let all = inclusive(t, x);
   if (t == ${WORKGROUP - 1}u) { blocks[block.x] = all; }
 }`;
 
-/// Also the number of pairs, and workgroups for them. Sums end at 2^32 - 1, far beyond what there is room for.
+/// Sums over them; the number of pairs, and workgroups for them. Sums end at 2^32 - 1, beyond what there is room for.
 export const SCAN_BLOCKS = `${FRAME}${GROUP_SCAN}
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read_write> counts: array<u32>;
@@ -88,67 +82,35 @@ export const SCAN_BLOCKS = `${FRAME}${GROUP_SCAN}
 var<workgroup> number: u32;
 @compute @workgroup_size(${WORKGROUP})
 fn main(@builtin(local_invocation_index) t: u32) {
-  if (t == 0u) { number = (counts[1] + ${SCAN_BLOCK - 1}u) / ${SCAN_BLOCK}u; }
-  let n = workgroupUniformLoad(&number);
-  var before = 0u;
-  for (var first = 0u; first < n; first += ${WORKGROUP}u) {
-    let at = first + t;
-    var x = 0u;
-    if (at < n) { x = blocks[at]; }
-    let sum = inclusive(t, x);
-    if (at < n) { blocks[at] = saturated(before, sum - x); }
-    before = saturated(before, sums[${WORKGROUP - 1}]);
-    workgroupBarrier();
-  }
+  if (t == 0u) { number = (counts[1] + ${WORKGROUP - 1}u) / ${WORKGROUP}u; }
+  let n = workgroupUniformLoad(&number);${scanOf('blocks', '0u')}
   if (t == 0u) {
     counts[3] = before;
     let pairs = min(before, frame.room);
     counts[2] = pairs;
-    arguments[12] = (pairs + ${SORT_BLOCK - 1}u) / ${SORT_BLOCK}u; arguments[13] = 1u; arguments[14] = 1u;
-  }
-}`;
-
-export const SCAN_APPLY = `${GROUP_SCAN}
-@group(0) @binding(0) var<storage, read> counts: array<u32>;
-@group(0) @binding(1) var<storage, read> order: array<u32>;
-@group(0) @binding(2) var<storage, read> tiles: array<u32>;
-@group(0) @binding(3) var<storage, read> blocks: array<u32>;
-@group(0) @binding(4) var<storage, read_write> offsets: array<u32>;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
-  let begin = block.x * ${SCAN_BLOCK}u + t * ${SCAN_ITEMS}u;
-  var x: array<u32, ${SCAN_ITEMS}>;
-  var sum = 0u;
-  for (var k = 0u; k < ${SCAN_ITEMS}u; k++) {
-    x[k] = 0u;
-    if (begin + k < counts[1]) { x[k] = tiles[order[begin + k]]; }
-    sum = saturated(sum, x[k]);
-  }
-  var before = saturated(blocks[block.x], inclusive(t, sum) - sum);
-  for (var k = 0u; k < ${SCAN_ITEMS}u; k++) {
-    if (begin + k < counts[1]) { offsets[begin + k] = before; }
-    before = saturated(before, x[k]);
+    arguments[8] = (pairs + ${SORT_BLOCK - 1}u) / ${SORT_BLOCK}u; arguments[9] = 1u; arguments[10] = 1u;
   }
 }`;
 
 /// A thread writes the pairs of a splat in few tiles; the workgroup together those of the others.
-export const emit = kind => `${FRAME}${KINDS[kind].functions}
+export const emit = kind => `${FRAME}${GROUP_SCAN}${KINDS[kind].functions}
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> counts: array<u32>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;
-@group(0) @binding(3) var<storage, read> offsets: array<u32>;
+@group(0) @binding(3) var<storage, read> blocks: array<u32>;
 @group(0) @binding(4) var<storage, read> tiles: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<Splat>;
 @group(0) @binding(6) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(7) var<storage, read_write> values: array<u32>;
 ${support(kind)}
+var<workgroup> starts: array<u32, ${WORKGROUP}>;  // the first pair of each splat
 var<workgroup> large: array<u32, ${WORKGROUP}>;
 var<workgroup> largeCount: atomic<u32>;
 
 /// Writes every \`step\`-th pair from the \`first\` on of the splat at \`place\` of the order.
 fn write(place: u32, first: u32, step: u32) {
   let i = order[place];
-  var at = offsets[place];
+  var at = starts[place % ${WORKGROUP}u];
   // Two compilations of one formula may round differently: no more than was counted, and no gaps.
   let end = min(saturated(at, tiles[i]), frame.room);
   let area = supportOf(splats[i], frame.reach);
@@ -168,23 +130,25 @@ fn write(place: u32, first: u32, step: u32) {
     values[rest] = i;
   }
 }
-fn saturated(a: u32, b: u32) -> u32 { return select(a + b, 0xffffffffu, a + b < a); }
 
 @compute @workgroup_size(${WORKGROUP})
 fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
-  if (t == 0u) { atomicStore(&largeCount, 0u); }
-  workgroupBarrier();
   let place = block.x * ${WORKGROUP}u + t;
+  var number = 0u;
+  if (place < counts[1]) { number = tiles[order[place]]; }
+  if (t == 0u) { atomicStore(&largeCount, 0u); }
+  starts[t] = saturated(blocks[block.x], inclusive(t, number) - number);
+  workgroupBarrier();
   if (place < counts[1]) {
-    if (tiles[order[place]] > ${LARGE}u) {
+    if (number > ${LARGE}u) {
       large[atomicAdd(&largeCount, 1u)] = place;
     } else {
       write(place, 0u, 1u);
     }
   }
   workgroupBarrier();
-  let number = atomicLoad(&largeCount);
-  for (var k = 0u; k < number; k++) { write(large[k], t, ${WORKGROUP}u); }
+  let many = atomicLoad(&largeCount);
+  for (var k = 0u; k < many; k++) { write(large[k], t, ${WORKGROUP}u); }
 }`;
 
 /// Where the pairs of each tile begin and end.

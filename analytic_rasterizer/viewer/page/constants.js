@@ -50,6 +50,9 @@ export function cellsOf(samples) {
   return Array.from({ length: samples }, (_, s) => [centre(s % side), centre(Math.floor(s / side))]);
 }
 
+/// In place of a footprint to compare with.
+export const PHOTOGRAPH = 'photograph';
+
 /// A footprint by its name, 'FAMILY' or 'FAMILY:OPTION=VALUE', as an entry of `known`: `footprints` of the scene
 /// (viewer/packing.py). Where the option is a variance it may have any value. Throws for an unknown name.
 export function parseFootprint(name, known) {

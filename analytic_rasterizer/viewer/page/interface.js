@@ -1,5 +1,7 @@
 // The controls: what the user does becomes calls of the viewer, and what the viewer shows becomes text.
 
+import { PHOTOGRAPH } from './constants.js';
+
 const element = id => document.getElementById(id);
 const DIVISORS = [1, 2, 4, 8];
 const COMPARISONS = ['off', 'split', 'difference'];
@@ -74,7 +76,8 @@ export class Interface {
       return option;
     });
     element('footprint').replaceChildren(...options());
-    element('compare').replaceChildren(new Option('nothing', ''), ...options());
+    const photographs = meta.photographs.length > 0 ? [new Option(PHOTOGRAPH, PHOTOGRAPH)] : [];
+    element('compare').replaceChildren(new Option('nothing', ''), ...photographs, ...options());
     const lacks = all.some(footprint => !renderer.draws(footprint));
     element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
       `${lacks ? ' Footprints in grey need WebGPU.' : ''}` +
@@ -241,10 +244,11 @@ export class Interface {
   /// Brings all controls in line with the state of the viewer.
   update() {
     const { footprint, compare, mode, divisor, divider } = this.viewer.state;
-    const comparing = compare !== null, split = comparing && mode === 'split';
+    const isPhotograph = compare === PHOTOGRAPH, { besidePhotograph } = this.viewer;
+    const comparing = isPhotograph ? besidePhotograph : compare !== null, split = comparing && mode === 'split';
     element('footprint').value = footprint;
     element('compare').value = compare ?? '';
-    element('compare-options').hidden = !comparing;
+    element('compare-options').hidden = compare === null;
     element('legend').hidden = !(comparing && mode === 'difference');
     for (const input of document.querySelectorAll('input[name="mode"]')) input.checked = input.value === mode;
     element('resolution').value = DIVISORS.indexOf(divisor);
@@ -261,18 +265,26 @@ export class Interface {
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
     element('label-left').textContent = this.inWords(footprint);
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
-    const given = [footprint, ...(comparing ? [compare] : [])].filter(name => this.inWords(name) !== name);
-    this.showNote(given.map(name => this.inWords(name)).join('; '));
+    const names = comparing && !isPhotograph ? [footprint, compare] : [footprint];
+    const given = names.map(name => this.inWords(name)).filter((words, k) => words !== names[k]);
+    const { view, lens } = this.viewer.camera, has = this.viewer.meta.photographs.includes(view);
+    const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
+    const notes = [...(isPhotograph && !besidePhotograph ? [missing] : []), given.join('; ')];
+    this.showNote([...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ').trim());
   }
 
   /// A footprint, and what is drawn for it where that is another one.
   inWords(name) {
+    if (name === PHOTOGRAPH) return `photograph of ${this.viewer.meta.views[this.viewer.camera.view].name}`;
     const drawn = this.viewer.drawn(name).name, wanted = this.viewer.footprint(name).name;
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows how fast frames are, and how large. `rate` is null where the camera rests.
-  showFigures(width, height, milliseconds, rate) {
+  /// Shows how fast frames are, and how large. `rate` is null where the camera rests. `stages` are milliseconds by name,
+  /// where the device tells.
+  showFigures(width, height, milliseconds, rate, stages) {
+    const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
+    element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
     element('figures').textContent = `${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
   }

@@ -16,7 +16,7 @@ export async function loadScene(meta, progress) {
     const geometry = await unpack('geometry');
     progress(0.5);
     const harmonics = await unpack('harmonics');
-    return { meta, geometry: new Float32Array(geometry), harmonics: new Uint16Array(harmonics) };
+    return sceneOf(meta, geometry, harmonics);
   }
   const responses = await Promise.all([get('geometry.bin'), get('harmonics.bin')]);
   const sizes = responses.map(response => Number(response.headers.get('Content-Length')));
@@ -26,7 +26,21 @@ export async function loadScene(meta, progress) {
       done[i] = bytes;
       progress((done[0] + done[1]) / total);
     })));
-  return { meta, geometry: new Float32Array(buffers[0]), harmonics: new Uint16Array(buffers[1]) };
+  return sceneOf(meta, ...buffers);
+}
+
+/// For compact scenes also `packed`, as it came; `geometry` then has no quaternions.
+function sceneOf(meta, geometry, harmonics) {
+  if (!meta.compact) return { meta, geometry: new Float32Array(geometry), harmonics: new Uint16Array(harmonics) };
+  const packed = new Uint32Array(geometry), floats = new Float32Array(geometry), halves = new Uint16Array(geometry);
+  const made = new Float32Array(2 * floats.length);
+  const half = bits => (bits < 1024 ? bits / 1024 : (1 + (bits & 1023) / 1024) * 2 ** ((bits >> 10) - 1)) / 16384;
+  for (let at = 0; at < floats.length; at += 6) {
+    made.set(floats.subarray(at, at + 3), 2 * at);
+    made[2 * at + 3] = half(halves[2 * at + 9]);
+    for (let k = 0; k < 3; ++k) made[2 * at + 4 + k] = meta.compact * half(halves[2 * at + 6 + k]);
+  }
+  return { meta, geometry: made, packed, harmonics: new Uint32Array(harmonics) };
 }
 
 /// The worker that sorts; sort.js of the server, or the text of it in an exported file.
@@ -36,9 +50,11 @@ export function startSorter() {
   return new Worker(url);
 }
 
-async function get(name) {
+/// What the server answers. Throws an Error with `sentence`, and what the server says.
+export async function get(name, sentence = 'The scene cannot be loaded.') {
   const response = await fetch(name).catch(() => null);
-  if (!response?.ok) throw new Error('The scene cannot be loaded. Is the command that serves it still running?');
+  if (!response) throw new Error(`${sentence} Is the command that serves it still running?`);
+  if (!response.ok) throw new Error(`${sentence} ${await response.text()}`);
   return response;
 }
 

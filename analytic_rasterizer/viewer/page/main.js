@@ -24,39 +24,29 @@ async function renderView(viewer, k, footprint, width, height) {
     try {
       await renderer.draw({ camera: pinhole, pictures: [{ name: 'asked', footprint: parsed }], settled: true });
       renderer.present({ left: 'asked', background: meta.background });
-      return pinhole;
+      return;
     } catch (error) {
       if (!await viewer.wasLost(renderer)) throw error;
     }
   }
 }
 
-/// Times every footprint in turn, `rounds` times. Milliseconds per frame: the median and every round.
-async function bench(viewer, camera, rounds) {
-  const { renderer, meta } = viewer, footprints = meta.footprints.filter(footprint => renderer.draws(footprint));
-  const times = Object.fromEntries(footprints.map(({ name }) => [name, []]));
-  for (let round = -1; round < rounds; ++round) {  // the first compiles shaders and is not counted
-    for (const footprint of footprints) {
-      const start = performance.now();
-      await renderer.draw({ camera, pictures: [{ name: 'asked', footprint }], settled: false });
-      if (round >= 0) times[footprint.name].push(performance.now() - start);
-    }
+/// The picture that was asked for last, over the background, as the rasterizer orders it: (3, H, W), not clamped.
+async function planes({ renderer, meta: { background } }) {
+  const values = await renderer.read('asked'), pixels = values.length / 4, made = new Float32Array(3 * pixels);
+  for (let p = 0; p < pixels; ++p) {
+    for (let c = 0; c < 3; ++c) made[c * pixels + p] = values[4 * p + c] + values[4 * p + 3] * background[c];
   }
-  const median = list => [...list].sort((a, b) => a - b)[list.length >> 1];
-  return {
-    renderer: renderer.name, device: renderer.describe(), count: meta.count, width: camera.width,
-    height: camera.height, rounds,
-    median_ms: Object.fromEntries(Object.entries(times).map(([name, list]) => [name, median(list)])), ms: times,
-  };
+  return made;
 }
 
 /// What the address asks for: a settled frame without controls, or null for the viewer itself.
 function automation(given) {
-  if (!['view', 'size', 'bench'].some(key => given.has(key))) return null;
+  if (!['view', 'size'].some(key => given.has(key))) return null;
   const size = given.get('size')?.match(/^(\d{1,5})x(\d{1,5})$/);
   if (given.has('size') && !(size && size[1] > 0 && size[2] > 0)) throw new Error('size must be like 640x480.');
   return {
-    view: Number(given.get('view') ?? 0), footprint: given.get('footprint'), rounds: Number(given.get('bench') ?? 0),
+    view: Number(given.get('view') ?? 0), footprint: given.get('footprint'),
     width: size ? Number(size[1]) : undefined, height: size ? Number(size[2]) : undefined,
   };
 }
@@ -69,7 +59,7 @@ async function main() {
   await viewer.load(await loadScene(viewer.meta, part => announce(`Loading the scene: ${Math.round(100 * part)}%`)));
   announce('');
   hideFailure();
-  window.analyticPixels = () => viewer.renderer.read('asked', viewer.meta.background);
+  window.analyticPixels = () => planes(viewer);
   window.analyticRender = (...view) => renderView(viewer, ...view);
   const asked = automation(given);
   if (asked === null) {
@@ -78,8 +68,7 @@ async function main() {
   }
   document.body.classList.add('bare');
   const footprint = asked.footprint ?? viewer.drawn(viewer.meta.footprint).name;
-  const pinhole = await renderView(viewer, asked.view, footprint, asked.width, asked.height);
-  if (asked.rounds > 0) window.analyticBench = await bench(viewer, pinhole, asked.rounds);
+  await renderView(viewer, asked.view, footprint, asked.width, asked.height);
   window.analyticReady = true;
 }
 

@@ -30,7 +30,8 @@ fn heat(part: f32) -> vec3f {
 @fragment fn show(@builtin(position) at: vec4f) -> @location(0) vec4f {
   let pixel = min(vec2u(at.xy / screen.canvas * vec2f(screen.size)), screen.size - 1u);
   let k = pixel.y * screen.size.x + pixel.x;
-  let a = over(left[k]); let b = over(right[k]);
+  let a = over(left[k]); var b = over(right[k]);
+  if (right[k].w < 0.0) { b = a; }  // beside a photograph
   if (screen.difference > 0.0) {
     let d = abs(a - b);
     return vec4f(heat(min(max(d.x, max(d.y, d.z)) / ${full}, 1.0)), 1.0);

@@ -3,15 +3,45 @@
 
 import { support } from './bin.wgsl.js';
 import { KINDS } from './footprint.wgsl.js';
-import { FRAME, WORKGROUP } from './frame.wgsl.js';
-import { addHarmonics, harmonicNumbers } from './sh.js';
+import { FRAME, WORKGROUP, wgslNumber } from './frame.wgsl.js';
+import { addHarmonics, sceneBytes } from './sh.js';
 
-function colorOf(degree) {
-  const words = harmonicNumbers(degree) / 2, number = k => `t${k >> 1}.${'xy'[k & 1]}`;
+// A Gaussian as the page gets it: `read` for its geometry, `number` for its harmonics.
+const PLAIN = {
+  read: `
+fn gaussianOf(i: u32) -> Gaussian {
+  let a = geometry[3u * i];
+  return Gaussian(a.xyz, a.w, geometry[3u * i + 1u].xyz, geometry[3u * i + 2u]);
+}`,
+  type: 'vec4f',
+  word: k => `unpack2x16float(harmonics[at + ${k}u])`,
+  number: k => `t${k >> 1}.${'xy'[k & 1]}`,
+};
+
+/// viewer/compact.py says what the words are.
+const compact = largest => ({
+  read: `
+fn gaussianOf(i: u32) -> Gaussian {
+  let at = 6u * i; let turn = geometry[at + 5u]; let last = turn >> 30u;
+  let mean = vec3f(bitcast<f32>(geometry[at]), bitcast<f32>(geometry[at + 1u]), bitcast<f32>(geometry[at + 2u]));
+  let b = unpack2x16float(geometry[at + 3u]); let c = unpack2x16float(geometry[at + 4u]);
+  let v = (vec3f(vec3u(turn, turn >> 10u, turn >> 20u) & vec3u(1023u)) / 511.0 - 1.0) * sqrt(0.5);
+  var q: vec4f;
+  q[last] = sqrt(max(1.0 - dot(v, v), 0.0));
+  for (var k = 0u; k < 3u; k++) { q[(last + 1u + k) & 3u] = v[k]; }
+  return Gaussian(mean, c.y, vec3f(b, c.x) * ${wgslNumber(largest)}, q / length(q));
+}`,
+  type: 'u32',
+  word: k => (k < 2 ? `unpack2x16float(harmonics[at + ${k}u])` : `unpack4x8snorm(harmonics[at + ${k}u]) * t1.y`),
+  number: k => (k < 3 ? `t${k >> 1}.${'xy'[k & 1]}` : `t${2 + ((k - 3) >> 2)}.${'xyzw'[(k - 3) & 3]}`),
+});
+
+function colorOf(meta, { word, number }) {
+  const { sh_degree: degree } = meta, words = sceneBytes(meta)[1] / 4;
   return `
 fn colorOf(i: u32, direction: vec3f) -> vec3f {
   let at = i * ${words}u;
-  ${Array.from({ length: words }, (_, k) => `let t${k} = unpack2x16float(harmonics[at + ${k}u]);`).join('\n  ')}
+  ${Array.from({ length: words }, (_, k) => `let t${k} = ${word(k)};`).join('\n  ')}
   let x = direction.x; let y = direction.y; let z = direction.z; let xx = x * x; let yy = y * y; let zz = z * z;
   var color = vec3f(0.5);
   ${addHarmonics(degree, number, 'vec3f')}
@@ -19,14 +49,17 @@ fn colorOf(i: u32, direction: vec3f) -> vec3f {
 }`;
 }
 
-export const project = (kind, degree) => `${FRAME}${KINDS[kind].functions}
+export function project(kind, meta) {
+  const form = meta.compact ? compact(meta.compact) : PLAIN;
+  return `${FRAME}${KINDS[kind].functions}
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> geometry: array<vec4f>;  // mean, opacity; scale, 0; quaternion w x y z
+@group(0) @binding(1) var<storage, read> geometry: array<${form.type}>;
 @group(0) @binding(2) var<storage, read> harmonics: array<u32>;
 @group(0) @binding(3) var<storage, read_write> splats: array<Splat>;
 @group(0) @binding(4) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> tiles: array<u32>;
-${support(kind)}${colorOf(degree)}
+struct Gaussian { mean: vec3f, opacity: f32, scale: vec3f, q: vec4f }  // quaternion w x y z
+${form.read}${support(kind)}${colorOf(meta, form)}
 // Keeps a compiler from fusing a product with a sum, which it cannot undo: frame.zero is 0 at run time only. Depths have
 // to be the rasterizer's to the last bit, since they order the splats.
 fn rounded(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ frame.zero); }
@@ -41,10 +74,9 @@ fn main(@builtin(global_invocation_id) id: vec3u, @builtin(num_workgroups) group
   if (i >= frame.count) { return; }
   keys[i] = 0xffffffffu;
   tiles[i] = 0u;
-  let g0 = geometry[3u * i]; let mean = g0.xyz; let opacity = g0.w;
+  let g = gaussianOf(i); let mean = g.mean; let opacity = g.opacity; let scale = g.scale; let q = g.q;
   let view = vec3f(row(frame.viewX, mean), row(frame.viewY, mean), row(frame.viewZ, mean));
   if (!(view.z > kNear)) { return; }
-  let scale = geometry[3u * i + 1u].xyz; let q = geometry[3u * i + 2u];
   if (!(within(scale.x, kMaxScale) && within(scale.y, kMaxScale) && within(scale.z, kMaxScale))) { return; }
   let ratio = view.xy / view.z;
   let centre = frame.pinhole.xy * ratio + frame.pinhole.zw - 0.5;
@@ -83,3 +115,4 @@ ${KINDS[kind].shape}
   tiles[i] = count;
   keys[i] = bitcast<u32>(view.z);
 }`;
+}

@@ -3,7 +3,7 @@
 //   create(canvas, meta, options)   of the class; before the scene is there
 //   load(scene)
 //   draws(footprint)                whether it can draw an entry of `footprints` of the scene
-//   draw({camera, pictures, settled, cancelled}), present(...), read(name, background)
+//   draw({camera, pictures, settled, cancelled}), put(name, size, values), present(...), read(name)
 //   isLost; `lost` resolves when the device is lost, `returned` when it can be had again
 //   dispose()
 
@@ -33,5 +33,6 @@ export async function openRenderer(meta, wish, bits) {
       reason = error.message;
     }
   }
+  if (meta.compact) throw new Error(`A compact scene needs WebGPU. WebGL 2 would draw: ${reason}`);
   return { renderer: await WebGLRenderer.create(freshCanvas(), meta, options), reason };
 }

@@ -21,3 +21,7 @@ export function addHarmonics(degree, number, vector) {
 
 /// Numbers that the harmonics of a Gaussian take: a multiple of four.
 export const harmonicNumbers = degree => 4 * Math.ceil((3 * (degree + 1) ** 2) / 4);
+
+/// Bytes of geometry and of harmonics of a Gaussian. `compact` is how small scenes are (viewer/compact.py).
+export const sceneBytes = ({ sh_degree: degree, compact }) => (compact
+  ? [24, 8 + 4 * Math.ceil((3 * ((degree + 1) ** 2 - 1)) / 4)] : [48, 2 * harmonicNumbers(degree)]);

@@ -1,5 +1,5 @@
 // A worker that orders Gaussians by depth. First message: {means, stride, count}, with the numbers of one Gaussian
-// `stride` apart. Then {row, near, exact}: the row of the world-to-camera matrix that gives the depth. Answer: {order},
+// `stride` apart. Then {row, near}: the row of the world-to-camera matrix that gives the depth. Answer: {order},
 // indices of what lies beyond `near`, the farthest first. Equal depths keep the rasterizer's order, in which the first
 // Gaussian of the input is in front.
 'use strict';
@@ -17,8 +17,7 @@ onmessage = ({ data }) => {
     return;
   }
   const visible = depths(data.row, data.near);
-  const sorted = data.exact ? sortExactly(visible) : sortRoughly(visible);
-  const order = sorted.slice(0, visible).reverse();
+  const order = sorted(visible).slice(0, visible).reverse();
   postMessage({ order }, [order.buffer]);
 };
 
@@ -40,7 +39,7 @@ function depths(row, near) {
 }
 
 /// Two stable counting passes over 16 bits each.
-function sortExactly(visible) {
+function sorted(visible) {
   let from = keys, to = keysB, a = indices, b = indicesB;
   for (const shift of [0, 16]) {
     const starts = new Uint32Array(65537);
@@ -54,18 +53,4 @@ function sortExactly(visible) {
     [from, to, a, b] = [to, from, b, a];
   }
   return a;
-}
-
-/// One counting pass over 65536 steps of the bits between the nearest and the farthest.
-function sortRoughly(visible) {
-  let least = 0xffffffff, most = 0;
-  for (let i = 0; i < visible; ++i) {
-    least = Math.min(least, keys[i]);
-    most = Math.max(most, keys[i]);
-  }
-  const factor = 65535 / Math.max(most - least, 1), starts = new Uint32Array(65537);
-  for (let i = 0; i < visible; ++i) ++starts[(((keys[i] - least) * factor) | 0) + 1];
-  for (let k = 0; k < 65536; ++k) starts[k + 1] += starts[k];
-  for (let i = 0; i < visible; ++i) indicesB[starts[((keys[i] - least) * factor) | 0]++] = indices[i];
-  return indicesB;
 }

@@ -35,6 +35,19 @@ fn inclusive(t: u32, x: u32) -> u32 {
 }
 `;
 
+/// Replaces n numbers of an array from first on by the sums of those before them; before is then that of all.
+export const scanOf = (array, first) => `
+  var before = 0u;
+  for (var begin = 0u; begin < n; begin += ${WORKGROUP}u) {
+    let k = begin + t; let at = ${first} + k;
+    var x = 0u;
+    if (k < n) { x = ${array}[at]; }
+    let sum = inclusive(t, x);
+    if (k < n) { ${array}[at] = saturated(before, sum - x); }
+    before = saturated(before, sums[${WORKGROUP - 1}]);
+    workgroupBarrier();
+  }`;
+
 export const SORT_COUNT = `${SORT}
 @group(0) @binding(2) var<storage, read> keysIn: array<u32>;
 @group(0) @binding(3) var<storage, read_write> histogram: array<u32>;
@@ -62,17 +75,7 @@ var<workgroup> sharedBlocks: u32;
 @compute @workgroup_size(${WORKGROUP})
 fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) digit: vec3u) {
   if (t == 0u) { sharedBlocks = blocksOf(counts[pass_.source]); }
-  let blocks = workgroupUniformLoad(&sharedBlocks);
-  var before = 0u;
-  for (var first = 0u; first < blocks; first += ${WORKGROUP}u) {
-    let at = first + t;
-    var x = 0u;
-    if (at < blocks) { x = histogram[digit.x * blocks + at]; }
-    let sum = inclusive(t, x);
-    if (at < blocks) { histogram[digit.x * blocks + at] = before + sum - x; }
-    before += sums[${WORKGROUP - 1}];
-    workgroupBarrier();
-  }
+  let n = workgroupUniformLoad(&sharedBlocks);${scanOf('histogram', 'digit.x * n')}
   if (t == 0u) { totals[digit.x] = before; }
 }`;
 

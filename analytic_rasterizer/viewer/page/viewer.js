@@ -2,9 +2,10 @@
 
 import { readAddress, writeAddress } from './address.js';
 import { Camera, add, between, depthAt, times } from './camera.js';
-import { parseFootprint } from './constants.js';
+import { PHOTOGRAPH, parseFootprint } from './constants.js';
 import { Interface, READING_TIME, announce, showFailure } from './interface.js';
 import { Pace } from './pace.js';
+import { Photographs } from './photograph.js';
 import { openRenderer } from './renderers.js';
 import { WebGLRenderer } from './webgl.js';
 
@@ -31,6 +32,7 @@ export class Viewer {
     this.losses = 0;
     this.controls = null;
     this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
+    this.photographs = new Photographs(() => this.wake());
     this.paces = new Map();
     this.settledTime = 0;  // ms
   }
@@ -152,7 +154,10 @@ export class Viewer {
     this.camera.lens = this.meta.views[k];
     this.controls.update();
     announce(`View ${this.meta.views[k].name}`, READING_TIME);
-    this.travel(this.camera.poseOfView(k), () => { this.atView = true; });
+    this.travel(this.camera.poseOfView(k), () => {
+      this.atView = true;
+      this.controls.update();
+    });
   }
 
   /// Moves to a pose, at once for people who prefer no motion.
@@ -201,7 +206,10 @@ export class Viewer {
 
   moved(onJourney = false) {
     if (!onJourney) this.journey = null;
-    this.atView = false;
+    if (this.atView) {
+      this.atView = false;
+      this.controls.update();
+    }
     this.movedAt = performance.now();
     this.wake();
     this.restLater();
@@ -225,6 +233,11 @@ export class Viewer {
   get size() {
     const ratio = window.devicePixelRatio || 1, { clientWidth, clientHeight } = this.surface;
     return [clientWidth, clientHeight].map(side => Math.max(1, Math.round(side * ratio)));
+  }
+
+  /// Whether a photograph is to be compared with, and can be: the camera is where it was taken.
+  get besidePhotograph() {
+    return this.state.compare === PHOTOGRAPH && this.atView && this.meta.photographs.includes(this.camera.view);
   }
 
   /// The camera of the canvas, at a resolution 1/divisor of it.
@@ -281,21 +294,22 @@ export class Viewer {
   /// when it begins to. False if there is no picture.
   async drawFrame() {
     const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
-    const left = this.drawn(footprint, moving), right = compare === null ? null : this.drawn(compare, moving);
+    const left = this.drawn(footprint, moving), alone = compare === null || compare === PHOTOGRAPH;
+    const right = alone ? null : this.drawn(compare, moving);
     const pace = moving ? this.paceOf(left, right) : null;
     const camera = this.pinhole(moving ? Math.max(divisor, pace.divisor) : divisor);
     const split = right !== null && mode === 'split', column = Math.ceil(divider * camera.width);
-    const pictures = [{ name: 'left', footprint: left, span: split ? [0, column] : undefined }];
-    if (right !== null) {
-      const span = split ? [Math.max(column - 1, 0), camera.width] : undefined;
-      pictures.push({ name: 'right', footprint: right, span });
-    }
+    const span = part => (split ? part : undefined), rest = span([Math.max(column - 1, 0), camera.width]);
+    const pictures = [{ name: 'left', footprint: left, span: span([0, column]) }];
+    if (right !== null) pictures.push({ name: 'right', footprint: right, span: rest });
     const start = performance.now(), cancelled = () => !moving && this.moving;
     if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
     const took = performance.now() - start;
     if (moving) pace.note(took);
     else this.settledTime = took;
-    this.shown = { left: 'left', right: right === null ? null : 'right', camera, moving };
+    let beside = right === null ? null : 'right';
+    if (this.besidePhotograph && this.photographs.place(this.renderer, camera, this.camera)) beside = PHOTOGRAPH;
+    this.shown = { left: 'left', right: beside, camera, moving };
     this.present();
     return true;
   }
@@ -323,7 +337,7 @@ export class Viewer {
       this.rate = this.rate === null ? rate : 0.8 * this.rate + 0.2 * rate;
     }
     this.lastDrawn = active ? now : null;
-    this.controls.showFigures(width, height, now - start, this.rate);
+    this.controls.showFigures(width, height, now - start, this.rate, this.renderer.stages ?? {});
   }
 
   /// Whether an error was that the device is lost, which may be told a little later.

@@ -3,14 +3,12 @@
 
 import { CONSTANTS } from './constants.js';
 import { startSorter } from './load.js';
-import { Projection } from './webgl_project.js';
+import { Projection, largestCount } from './webgl_project.js';
 import {
   FULL_SCREEN, GL_KINDS, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
 } from './webgl_shaders.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture } from './webgl_tools.js';
+import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
 
-// Above so many Gaussians the order is rough while the camera moves.
-const ROUGH_ORDER_FROM = 200000;
 const GEOMETRY_STRIDE = 12;
 const POLL = 50;  // ms
 
@@ -18,25 +16,25 @@ const POLL = 50;  // ms
 class Sorter {
   constructor({ geometry, meta }) {
     this.worker = startSorter();
-    this.known = { row: null, exact: false };
+    this.known = null;  // row of the matrix whose order is known
     this.busy = null;
     this.worker.postMessage({ means: geometry, stride: GEOMETRY_STRIDE, count: meta.count });
   }
 
-  knows(w2c, exact) {
-    return this.known.row === w2c.slice(8, 12).join() && (this.known.exact || !exact);
+  knows(w2c) {
+    return this.known === w2c.slice(8, 12).join();
   }
 
   /// Asks for the indices of the Gaussians in front of a camera, the farthest first, unless the worker is at work.
   /// `take` is called with them.
-  ask(w2c, exact, take) {
+  ask(w2c, take) {
     this.busy ??= new Promise((resolve, reject) => {
       this.worker.onmessage = ({ data }) => resolve(data.order);
       this.worker.onerror = () => reject(new Error('The worker that sorts the Gaussians has stopped.'));
       // Rounded as the rasterizer rounds the matrix.
-      this.worker.postMessage({ row: Float32Array.from(w2c.slice(8, 12)), near: CONSTANTS.kNear, exact });
+      this.worker.postMessage({ row: Float32Array.from(w2c.slice(8, 12)), near: CONSTANTS.kNear });
     }).then(order => {
-      this.known = { row: w2c.slice(8, 12).join(), exact };
+      this.known = w2c.slice(8, 12).join();
       take(order);
     }).finally(() => { this.busy = null; });
     return this.busy;
@@ -52,6 +50,11 @@ export class WebGLRenderer {
     });
     if (!gl) throw new Error('This viewer needs WebGPU or WebGL 2, which this browser or this machine does not offer.');
     if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < 4096) throw new Error('This viewer needs textures of 4096 pixels.');
+    const { count, sh_degree: degree } = meta, most = largestCount(gl.getParameter(gl.MAX_TEXTURE_SIZE), degree);
+    if (count > most) {
+      throw new Error(`The scene has ${count.toLocaleString('en')} Gaussians; this device can hold ` +
+        `${most.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
+    }
     return new WebGLRenderer(canvas, gl, bits, fullDifference);
   }
 
@@ -81,7 +84,6 @@ export class WebGLRenderer {
 
   /// Throws an Error with a sentence where the device cannot hold the scene.
   async load(scene) {
-    this.count = scene.meta.count;
     this.projection = new Projection(this.gl, scene);
     this.sorter = new Sorter(scene);
   }
@@ -121,14 +123,23 @@ export class WebGLRenderer {
     return made;
   }
 
+  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
+  put(name, { width, height }, values) {
+    const { gl } = this, format = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
+    gl.deleteTexture(this.pictures.get(name)?.texture ?? null);
+    const texture = createTexture(gl, width, height, format);
+    fillTexture(gl, texture, width, format, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
+    this.pictures.set(name, { width, height, texture });
+  }
+
   /// Draws pictures, each {name, footprint, span}, of which the columns from span[0] on up to span[1] are needed [px];
   /// `settled` ones as exactly as the device can. False if `cancelled` has become true; there is no picture then.
   async draw({ camera, pictures, settled, cancelled = () => false }) {
-    const exact = settled || this.count < ROUGH_ORDER_FROM, { sorter } = this, { gl } = this;
-    while (!sorter.knows(camera.w2c, exact)) {
-      const order = sorter.ask(camera.w2c, exact, found => { if (!this.isLost) this.projection.setOrder(found); });
+    const { sorter } = this;
+    while (!sorter.knows(camera.w2c)) {
+      const order = sorter.ask(camera.w2c, found => { if (!this.isLost) this.projection.setOrder(found); });
       // An order that is a little old will do while the camera moves.
-      if (!settled && sorter.known.row !== null) break;
+      if (!settled && sorter.known !== null) break;
       await Promise.race([order, new Promise(resolve => setTimeout(resolve, POLL))]);
       if (cancelled()) return false;
     }
@@ -198,9 +209,9 @@ export class WebGLRenderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /// The picture over the background as the rasterizer orders it: (3, height, width), not clamped. Rejects where there
-  /// is none, as after the device was lost.
-  async read(name, background) {
+  /// Colour and transmittance of a picture: four numbers a pixel. Rejects where there is none, as after the device was
+  /// lost.
+  async read(name) {
     const gl = this.gl, picture = this.pictures.get(name);
     if (!picture || gl.isContextLost()) throw new Error('There is no picture: the graphics device was lost since.');
     const { framebuffer, width, height } = picture, pixels = width * height;
@@ -214,18 +225,7 @@ export class WebGLRenderer {
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
     }
     if (gl.isContextLost()) throw new Error('The graphics device was lost while the picture was read.');
-    const planes = new Float32Array(3 * pixels);
-    for (let p = 0; p < pixels; ++p) {
-      const rest = 1 - values[4 * p + 3];
-      for (let c = 0; c < 3; ++c) planes[c * pixels + p] = values[4 * p + c] + rest * background[c];
-    }
-    return planes;
-  }
-
-  /// What draws, in the words of the system.
-  describe() {
-    const { gl } = this, info = gl.getExtension('WEBGL_debug_renderer_info');
-    return info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
+    return values.map((value, at) => (at % 4 === 3 ? 1 - value : value));
   }
 
   dispose() {

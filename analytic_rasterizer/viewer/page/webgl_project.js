@@ -16,15 +16,11 @@ export function deviceBytes(count, degree) {
 }
 
 export class Projection {
-  /// `scene` is what loadScene returned. Throws an Error with a sentence where the device cannot hold it.
+  /// `scene` is what loadScene returned, of at most largestCount Gaussians. Throws an Error with a sentence where the
+  /// device has no room for it.
   constructor(gl, scene) {
     const { count, sh_degree: degree } = scene.meta;
     const maxSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    const most = largestCount(maxSize, degree);
-    if (count > most) {
-      throw new Error(`The scene has ${count.toLocaleString('en')} Gaussians; this device can hold ` +
-        `${most.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
-    }
     this.gl = gl;
     this.count = count;
     this.degree = degree;

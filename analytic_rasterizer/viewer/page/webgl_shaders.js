@@ -260,8 +260,7 @@ uniform float uDivider;  // canvas px; right of it is uRight
 uniform bool uDifference;
 uniform float uFull;     // difference of the last colour
 out vec4 color;
-vec3 over(sampler2D picture, ivec2 at) {
-  vec4 c = texelFetch(picture, at, 0);
+vec3 over(vec4 c) {
   return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0);
 }
 vec3 heat(float t) {
@@ -274,13 +273,9 @@ vec3 heat(float t) {
 void main() {
   vec2 at = vec2(gl_FragCoord.x, uCanvas.y - gl_FragCoord.y);
   ivec2 texel = min(ivec2(at / uCanvas * uSize), ivec2(uSize) - 1);
-  if (uDifference) {
-    vec3 d = abs(over(uLeft, texel) - over(uRight, texel));
-    color = vec4(heat(min(max(d.r, max(d.g, d.b)) / uFull, 1.0)), 1.0);
-  } else if (at.x < uDivider) {
-    color = vec4(over(uLeft, texel), 1.0);
-  } else {
-    color = vec4(over(uRight, texel), 1.0);
-  }
+  vec4 a = texelFetch(uLeft, texel, 0), b = texelFetch(uRight, texel, 0);
+  if (b.a > 1.5) b = a;  // beside a photograph
+  vec3 d = abs(over(a) - over(b));
+  color = vec4(uDifference ? heat(min(max(d.r, max(d.g, d.b)) / uFull, 1.0)) : over(at.x < uDivider ? a : b), 1.0);
 }
 `;

@@ -3,8 +3,8 @@
 import { KINDS, sampling } from './footprint.wgsl.js';
 import { TILE, frameData } from './frame.wgsl.js';
 import { SCREEN_BYTES, present, screenData } from './present.wgsl.js';
-import { harmonicNumbers } from './sh.js';
-import { Passes, largestBinding, tilesOf } from './webgpu_passes.js';
+import { sceneBytes } from './sh.js';
+import { Passes, STAGES, largestBinding, tilesOf } from './webgpu_passes.js';
 
 const BAND_TIME = 250;   // ms that the device may blend at a stretch: systems end what seems to hang
 const FIRST_BANDS = 8;   // of a picture, as long as nothing has been measured
@@ -18,17 +18,19 @@ export class WebGPURenderer {
     if (!adapter) throw new Error('WebGPU finds no graphics device here.');
     const inSoftware = adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter ?? false;
     if (inSoftware && !software) throw new Error('WebGPU would have no graphics device here.');
-    const { count, sh_degree: degree } = meta, needed = largestBinding(count, degree);
+    const needed = largestBinding(meta);
     const { maxStorageBufferBindingSize: most } = adapter.limits;
     if (needed > most) {
-      const fits = Math.floor(most / largestBinding(1, degree));
-      throw new Error(`the scene has ${count.toLocaleString('en')} Gaussians, and WebGPU on this device can hold ` +
-        `${fits.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
+      const fit = form => Math.floor(most / largestBinding({ ...form, count: 1 })).toLocaleString('en');
+      throw new Error(`the scene has ${meta.count.toLocaleString('en')} Gaussians, and WebGPU on this device can hold ` +
+        `${fit(meta)} of spherical harmonics of degree ${meta.sh_degree}` +
+        `${meta.compact ? '.' : `, or ${fit({ ...meta, compact: 1 })} with --compact.`}`);
     }
     // Where the default of 128 MiB is enough, none is asked for.
     const requiredLimits = needed <= 2 ** 27 ? {}
       : { maxStorageBufferBindingSize: most, maxBufferSize: adapter.limits.maxBufferSize };
-    const device = await adapter.requestDevice({ requiredLimits });
+    const requiredFeatures = ['timestamp-query'].filter(feature => adapter.features.has(feature));
+    const device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
     const context = canvas.getContext('webgpu');
     if (!context) throw new Error('WebGPU cannot draw into the page.');
     return new WebGPURenderer(canvas, context, device, fullDifference);
@@ -40,6 +42,7 @@ export class WebGPURenderer {
     this.pictures = new Map();
     this.rate = null;    // ms for a sample of a pair
     this.pairs = null;   // of the last picture
+    this.stages = {};    // ms of the last frame, where the device tells
     this.turn = Promise.resolve();
     this.isLost = false;
     this.lost = device.lost.then(() => { this.isLost = true; });
@@ -54,13 +57,13 @@ export class WebGPURenderer {
     });
     const { UNIFORM, COPY_DST, MAP_READ } = GPUBufferUsage;
     this.screen = device.createBuffer({ size: SCREEN_BYTES, usage: UNIFORM | COPY_DST });
-    this.numbers = device.createBuffer({ size: 16, usage: MAP_READ | COPY_DST });
+    this.numbers = device.createBuffer({ size: 16 + 16 * STAGES.length, usage: MAP_READ | COPY_DST });
   }
 
   /// Throws an Error with a sentence where the device has no room.
   async load(scene) {
     if (!await this.fits(() => { this.passes = new Passes(this.device, scene); })) {
-      const { count, sh_degree: degree } = scene.meta, bytes = count * (120 + 2 * harmonicNumbers(degree));
+      const [geometry, harmonics] = sceneBytes(scene.meta), bytes = scene.meta.count * (68 + geometry + harmonics);
       throw new Error(`The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its ` +
         'memory.');
     }
@@ -86,6 +89,7 @@ export class WebGPURenderer {
   }
 
   async drawNow({ camera, pictures, cancelled = () => false }) {
+    this.stages = {};
     for (const { name, footprint, span = [0, camera.width] } of pictures) {
       const picture = this.picture(name, camera), [, rows] = tilesOf(camera);
       const region = [Math.floor(span[0] / TILE), 0, Math.ceil(span[1] / TILE), rows];
@@ -116,6 +120,11 @@ export class WebGPURenderer {
     return made;
   }
 
+  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
+  put(name, size, values) {
+    this.device.queue.writeBuffer(this.picture(name, size).buffer, 0, values);
+  }
+
   async drawRegion(picture, camera, footprint, region, cancelled) {
     const { device, passes } = this, [, top, , bottom] = region, rows = bottom - top;
     for (;;) {
@@ -129,9 +138,10 @@ export class WebGPURenderer {
       encoder.clearBuffer(picture.ranges);
       passes.encode(encoder, bands === 1 ? [...steps, blended(top, rows)] : steps);
       encoder.copyBufferToBuffer(passes.counts, 0, this.numbers, 0, 16);
+      passes.stamp(encoder, this.numbers, 16);
       device.queue.submit([encoder.finish()]);
       await this.numbers.mapAsync(GPUMapMode.READ);
-      const [, , , wanted] = new Uint32Array(this.numbers.getMappedRange().slice(0));
+      const numbers = this.numbers.getMappedRange().slice(0), wanted = new Uint32Array(numbers)[3];
       this.numbers.unmap();
       this.complain();
       if (wanted > passes.room) {  // what was blended has holes
@@ -142,6 +152,7 @@ export class WebGPURenderer {
           && await this.drawRegion(picture, camera, footprint, [left, middle, right, bottom], cancelled);
       }
       this.pairs = wanted;
+      if (passes.queries) this.noteStages(new BigUint64Array(numbers, 16), bands === 1 ? STAGES : STAGES.slice(0, -1));
       if (bands === 1) this.measure(footprint, performance.now() - start, wanted);
       return bands === 1 || await this.blendInBands(blended, footprint, top, bottom, bands, cancelled);
     }
@@ -163,6 +174,12 @@ export class WebGPURenderer {
     return Math.min(Math.max(Math.ceil(wanted), 1), rows);
   }
 
+  noteStages(stamps, stages) {
+    for (const [k, stage] of stages.entries()) {
+      this.stages[stage] = (this.stages[stage] ?? 0) + Number(stamps[2 * k + 1] - stamps[2 * k]) / 1e6;
+    }
+  }
+
   measure(footprint, milliseconds, pairs) {
     this.rate = milliseconds / (Math.max(pairs, 1) * footprint.samples);
   }
@@ -176,7 +193,9 @@ export class WebGPURenderer {
       this.device.queue.submit([encoder.finish()]);
       await this.device.queue.onSubmittedWorkDone();
     }
-    this.measure(footprint, performance.now() - start, this.pairs);
+    const took = performance.now() - start;
+    this.measure(footprint, took, this.pairs);
+    if (this.passes.queries) this.stages.blend = (this.stages.blend ?? 0) + took;
     return true;
   }
 
@@ -200,27 +219,19 @@ export class WebGPURenderer {
     device.queue.submit([encoder.finish()]);
   }
 
-  /// The picture over the background as the rasterizer orders it: (3, height, width), not clamped.
-  async read(name, background) {
+  /// Colour and transmittance of a picture: four numbers a pixel. Rejects where there is none.
+  async read(name) {
     const picture = this.pictures.get(name);
     if (!picture || this.isLost) throw new Error('There is no picture: the graphics device was lost since.');
-    const { MAP_READ, COPY_DST } = GPUBufferUsage, pixels = picture.width * picture.height, { size } = picture.buffer;
+    const { MAP_READ, COPY_DST } = GPUBufferUsage, { size } = picture.buffer;
     const staging = this.device.createBuffer({ size, usage: MAP_READ | COPY_DST });
     const encoder = this.device.createCommandEncoder();
     encoder.copyBufferToBuffer(picture.buffer, 0, staging, 0, size);
     this.device.queue.submit([encoder.finish()]);
     await staging.mapAsync(GPUMapMode.READ);
-    const values = new Float32Array(staging.getMappedRange().slice(0)), planes = new Float32Array(3 * pixels);
+    const values = new Float32Array(staging.getMappedRange().slice(0));
     staging.destroy();
-    for (let p = 0; p < pixels; ++p) {
-      for (let c = 0; c < 3; ++c) planes[c * pixels + p] = values[4 * p + c] + values[4 * p + 3] * background[c];
-    }
-    return planes;
-  }
-
-  /// What draws, in the words of the system.
-  describe() {
-    return this.name;
+    return values;
   }
 
   dispose() {

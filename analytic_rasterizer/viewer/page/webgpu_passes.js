@@ -1,23 +1,23 @@
 // The passes of a picture with WebGPU: their buffers, pipelines and order. Default limits are enough for all of them: at
-// most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. No feature that is optional is used.
+// most 7 storage buffers, 256 threads, 9.3 KiB of workgroup memory. Timestamps are an optional feature: they are shown.
 
-import {
-  COUNT_VISIBLE, RANGES, SCAN_APPLY, SCAN_BLOCK, SCAN_BLOCKS, SCAN_REDUCE, emit,
-} from './bin.wgsl.js';
+import { COUNT_VISIBLE, RANGES, SCAN_BLOCKS, SCAN_REDUCE, emit } from './bin.wgsl.js';
 import { blend } from './blend.wgsl.js';
 import { FRAME_BYTES, TILE, WORKGROUP } from './frame.wgsl.js';
 import { project } from './project.wgsl.js';
-import { harmonicNumbers } from './sh.js';
+import { sceneBytes } from './sh.js';
 import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './sort.wgsl.js';
 
 const MOST_WORKGROUPS = 65535;  // along one direction
 const SPLAT_BYTES = 48;
-const FIRST_ROOM = 65536;       // pairs, at least
+const FIRST_ROOM = 65536;       // pairs, until it is known how many there are
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
-const VISIBLE_SORT = 0, VISIBLE_SCAN = 16, VISIBLE_EMIT = 32, PAIRS_SORT = 48;
+const VISIBLE_SORT = 0, VISIBLE_EMIT = 16, PAIRS_SORT = 32;
+
+export const STAGES = ['project', 'sort', 'bin', 'sort tiles', 'blend'];  // of a picture, in this order
 
 /// Bytes of the largest binding that a scene needs.
-export const largestBinding = (count, degree) => count * Math.max(SPLAT_BYTES, 2 * harmonicNumbers(degree));
+export const largestBinding = meta => meta.count * Math.max(SPLAT_BYTES, ...sceneBytes(meta));
 
 /// Pipelines and bind groups, each made once.
 class Pipelines {
@@ -55,28 +55,31 @@ class Pipelines {
 
 export class Passes {
   /// Uploads the scene, which loadScene returned.
-  constructor(device, { meta, geometry, harmonics }) {
+  constructor(device, { meta, geometry, harmonics, packed = geometry }) {
     this.device = device;
     this.pipelines = new Pipelines(device);
     this.count = meta.count;
-    this.degree = meta.sh_degree;
+    this.meta = meta;
     this.numbered = 0;
     this.uniforms = new Map();
     this.room = 0;
     const n = this.count, words = 4 * n;
-    this.geometry = this.buffer(geometry.byteLength, geometry);
+    this.geometry = this.buffer(packed.byteLength, packed);
     this.harmonics = this.buffer(harmonics.byteLength, harmonics);
     this.splats = this.buffer(SPLAT_BYTES * n);
     this.depths = [this.buffer(words), this.buffer(words)];
     this.order = [this.buffer(words), this.buffer(words)];
     this.tiles = this.buffer(words);
-    this.offsets = this.buffer(words);
-    this.blocks = this.buffer(4 * (Math.ceil(n / SCAN_BLOCK) + 1));
+    this.blocks = this.buffer(4 * (Math.ceil(n / WORKGROUP) + 1));
     this.counts = this.buffer(16, new Uint32Array([n, 0, 0, 0]));
-    this.arguments = this.buffer(64, null, GPUBufferUsage.INDIRECT);
+    this.arguments = this.buffer(48, null, GPUBufferUsage.INDIRECT);
     this.totals = this.buffer(64);
     this.frame = this.uniform(FRAME_BYTES);
-    this.reserve(Math.max(2 * n, FIRST_ROOM));
+    if (device.features.has('timestamp-query')) {
+      this.queries = device.createQuerySet({ type: 'timestamp', count: 2 * STAGES.length });
+      this.stamps = this.buffer(16 * STAGES.length, null, GPUBufferUsage.QUERY_RESOLVE);
+    }
+    this.reserve(FIRST_ROOM);
   }
 
   buffer(bytes, data = null, usage = 0) {
@@ -124,20 +127,21 @@ export class Passes {
 
   /// Steps of a stable sort by `bits`. `source` is the place of their number in counts. [keys, values] are pairs of
   /// buffers; the result is in the first ones.
-  *sort(keys, values, bits, source, offset, drops) {
+  *sort(stage, keys, values, bits, source, offset, drops) {
     for (let shift = 0; shift < bits; shift += SORT_BITS) {
       const first = drops && shift === 0, uniform = this.constant(shift, first ? 0 : source, first ? 1 : 0, 0);
       const size = first ? [Math.ceil(this.count / SORT_BLOCK)] : this.indirect(offset);
       const { counts, histogram, totals } = this;
-      yield { key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
-      yield { key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
+      yield { stage, key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
+      yield { stage, key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
         size: [2 ** SORT_BITS] };
-      yield { key: 'sort scatter', code: () => SORT_SCATTER,
+      yield { stage, key: 'sort scatter', code: () => SORT_SCATTER,
         buffers: [uniform, counts, keys[0], values[0], keys[1], values[1], histogram, totals], size };
       keys.reverse();
       values.reverse();
       if (first) {
-        yield { key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments], size: [1] };
+        yield { stage, key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments],
+          size: [1] };
       }
     }
   }
@@ -145,36 +149,49 @@ export class Passes {
   /// The steps that fill the lists of a picture with this many columns and rows of tiles, and then
   /// `blended(first row, rows)`, a step that draws some of its rows.
   steps(footprint, [columns, rows], width, ranges, picture) {
-    const { counts, tiles, offsets, blocks, splats, frame, degree } = this, { kind } = footprint;
+    const { counts, tiles, blocks, splats, frame } = this, { kind } = footprint;
     const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
     const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
     const steps = [
-      { key: `project ${kind} ${degree}`, code: () => project(kind, degree),
+      { stage: 'project', key: `project ${kind}`, code: () => project(kind, this.meta),
         buffers: [frame, this.geometry, this.harmonics, splats, depths[0], tiles],
         size: [across, Math.ceil(groups / across)] },
-      ...this.sort(depths, order, 32, 1, VISIBLE_SORT, true),
-      { key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
-        size: this.indirect(VISIBLE_SCAN) },
-      { key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments], size: [1] },
-      { key: 'scan apply', code: () => SCAN_APPLY, buffers: [counts, order[0], tiles, blocks, offsets],
-        size: this.indirect(VISIBLE_SCAN) },
-      { key: `emit ${kind}`, code: () => emit(kind),
-        buffers: [frame, counts, order[0], offsets, tiles, splats, pairKeys[0], pairs[0]],
+      ...this.sort('sort', depths, order, 32, 1, VISIBLE_SORT, true),
+      { stage: 'bin', key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
         size: this.indirect(VISIBLE_EMIT) },
-      ...this.sort(pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
-      { key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges], size: this.indirect(PAIRS_SORT) },
+      { stage: 'bin', key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments],
+        size: [1] },
+      { stage: 'bin', key: `emit ${kind}`, code: () => emit(kind),
+        buffers: [frame, counts, order[0], blocks, tiles, splats, pairKeys[0], pairs[0]],
+        size: this.indirect(VISIBLE_EMIT) },
+      ...this.sort('sort tiles', pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
+      { stage: 'sort tiles', key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges],
+        size: this.indirect(PAIRS_SORT) },
     ];
     const blended = (first, number) => ({
-      key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
+      stage: 'blend', key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
       buffers: [frame, this.constant(first, 0, 0, 0), ranges, pairs[0], splats, picture], size: [width, number],
     });
     return { steps, blended };
   }
 
+  /// Each stage is a pass of its own, for the timestamps of its begin and end.
   encode(encoder, steps) {
-    const pass = encoder.beginComputePass();
-    for (const step of steps) this.pipelines.encode(pass, step);
-    pass.end();
+    for (const [k, stage] of STAGES.entries()) {
+      const own = steps.filter(step => step.stage === stage), { queries: querySet } = this;
+      if (own.length === 0) continue;
+      const pass = encoder.beginComputePass(querySet &&
+        { timestampWrites: { querySet, beginningOfPassWriteIndex: 2 * k, endOfPassWriteIndex: 2 * k + 1 } });
+      for (const step of own) this.pipelines.encode(pass, step);
+      pass.end();
+    }
+  }
+
+  /// Copies the timestamps into a buffer.
+  stamp(encoder, buffer, at) {
+    if (!this.queries) return;
+    encoder.resolveQuerySet(this.queries, 0, 2 * STAGES.length, this.stamps, 0);
+    encoder.copyBufferToBuffer(this.stamps, 0, buffer, at, 16 * STAGES.length);
   }
 }
 

@@ -1,0 +1,49 @@
+"""The photographs that a training saw, for its views."""
+
+from __future__ import annotations
+
+import io as memory
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from ..io import FoundScene, View, to_image
+from ..training.captures import Photograph, load_capture
+from ..training.options import TrainingOptions
+from ..training.pictures import load_pictures
+from ..training.start import capture_arguments
+
+
+def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Callable[[], bytes]], list[str]]:
+    """The photographs of a training's capture by the numbers of their views, and what to say of them.
+
+    Views with a lens have none, since the page draws them without it. A photograph is read when its function is
+    called, which returns a PNG of what the training saw: reduced, cut and on the background as there.
+    """
+    if found.options is None or not views:
+        return {}, []
+    try:
+        source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # which the training has said
+            capture = load_capture(source["scene"], **capture_arguments(source))
+    except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
+        return {}, [f"no photographs: {error}"]
+    items = {item.view.name: item for item in (*capture.train, *capture.test)}
+    background = (found.background or (capture.background, ""))[0]
+
+    def reader(item: Photograph) -> Callable[[], bytes]:
+        return lambda: png(item, options, background)
+
+    made = {k: reader(items[view.name]) for k, view in enumerate(views) if view.name in items and view.lens is None}
+    return made, [f"{len(made)} photographs of {Path(source['scene'])} to compare with"]
+
+
+def png(item: Photograph, options: TrainingOptions, background: tuple[float, float, float]) -> bytes:
+    """A photograph as the training saw it, at its finest scale."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pictures = load_pictures([item], options.scales, background, "cpu", options.downsampling)
+    file = memory.BytesIO()
+    to_image(pictures.truth(min(options.scales), 0)[:3]).save(file, "PNG", compress_level=1)
+    return file.getvalue()
