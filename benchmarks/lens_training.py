@@ -182,7 +182,11 @@ def main() -> None:
     for name, lens in (("pinhole", "keep"), ("opencv", "keep"), ("opencv", "undistort"), ("fisheye", "keep")):
         for seed in args.seeds:
             options = training.TrainingOptions(
-                iterations=args.iterations, footprint=args.footprint, seed=seed, background=args.background
+                iterations=args.iterations,
+                footprint=args.footprint,
+                seed=seed,
+                background=args.background,
+                effects="none",
             )
             out = args.out / f"{name}_{lens}_{seed}"
             run = training.Run(args.out / name, out, options, device=args.device, lens=lens)

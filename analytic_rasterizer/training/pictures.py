@@ -255,9 +255,11 @@ def _orientation(opened) -> int:
 
 
 def read_header(path: Path) -> Header:
-    """Raises io.SceneError."""
+    """Reads no pixels, and no EXIF behind them, which is rare. Raises io.SceneError."""
     with opened_picture(path, "train") as opened:
-        return Header(*opened.size, _orientation(opened))
+        # Pillow decodes a .png that has no EXIF before its pixels, to look behind them.
+        upright = opened.format == "PNG" and "exif" not in opened.info
+        return Header(*opened.size, UPRIGHT if upright else _orientation(opened))
 
 
 def fitted(

@@ -27,7 +27,7 @@ from .protocols import Row, Table
 from .report import Results, as_dict, markdown
 
 # What makes a row what it is.
-FIXED = ("footprint", "scales", "scale_repeats", "downsampling", "filter_3d", "supersampling")
+FIXED = ("effects", "footprint", "scales", "scale_repeats", "downsampling", "filter_3d", "supersampling")
 
 
 class Job(NamedTuple):
@@ -95,7 +95,7 @@ def run_table(
             if missing:
                 skipped.append(missing)
                 continue
-            values = preset_values(preset, table.options["scales"]) | changes | table.training_options(row, scene)
+            values = preset_values(preset, table.options["scales"]) | {"effects": "none"} | changes | table.training_options(row, scene)
             folder = Path(out) / table.training / row.name / scene
             jobs.append(Job(row, scene, place, folder, TrainingOptions(**values)))
     skipped = list(dict.fromkeys(skipped))
