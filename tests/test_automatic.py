@@ -131,7 +131,7 @@ def test_missing_pictures_and_cameras_far_away(tmp_path, capsys):
     assert described(tmp_path / "out")["source"]["missing"] == "skip"
     assert train(tmp_path / "wall", tmp_path / "refused", "--missing", "refuse") == 2
     error = capsys.readouterr().err
-    assert "1 of 10 pictures are missing" in error and error.count("\n") == 1
+    assert "1 of 9 pictures are missing" in error and error.count("\n") == 1
 
 
 def test_a_capture_that_cannot_be_looked_at(even, tmp_path, capsys, monkeypatch):
