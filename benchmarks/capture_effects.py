@@ -50,7 +50,7 @@ from analytic_rasterizer.training.files import write_json
 
 FAR = 1000  # extents, at which the camera is that is thrown far away
 GAMMA = 2.2  # of stored values, nearly
-MOST_POINTS = 20_000  # for captures without
+MOST_POINTS = 30_000  # for captures without
 BLUR = 2.0  # px, radius
 
 
@@ -152,7 +152,9 @@ def write_copies(folder: Path, out: Path, args: argparse.Namespace) -> str:
     shutil.rmtree(out, ignore_errors=True)
     write_copy(out / "clean", capture, args, spoiled=False)
     if capture.points is None:
-        options = TrainingOptions(iterations=args.point_steps, effects="none", background=background)
+        options = TrainingOptions(
+            iterations=args.point_steps, random_points=MOST_POINTS, effects="none", background=background
+        )
         run = Run(out / "clean", out / "points", options, device=args.device, save_every=0)
         run.train()
         capture = capture._replace(points=points_of(run))
