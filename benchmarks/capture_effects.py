@@ -59,7 +59,7 @@ class Row(NamedTuple):
 
     copy: str
     effects: str
-    masks: str = "auto"
+    masks: str | None = None
 
 
 ROWS = {
