@@ -1,4 +1,4 @@
-"""Trains on a capture, and on a spoiled copy of it with `--effects auto` and without, and compares on clean photographs.
+"""Trains on a capture, and on a spoiled copy of it with `--effects auto` and without, and tests on clean photographs.
 
     python benchmarks/capture_effects.py lego bonsai fox --out effects --device cuda
     python benchmarks/capture_effects.py lego --out effects --device cpu --reduce 4 --iterations 50

@@ -64,8 +64,8 @@ class Run:
     Args:
         scene: Folder of a capture, see `load_capture`.
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
-        options: None: the defaults, or with `resume` those of the checkpoint. With `effects` "auto", which is a default,
-            and without `resume`, the capture is looked at, and `Run.options` are those that it calls for. stderr says so.
+        options: None: the defaults, or with `resume` those of the checkpoint. With their `effects` "auto", the default,
+            a training that begins has what the capture calls for in `Run.options`, and says so on stderr.
         device: "cpu", "cuda" or "cuda:N".
         images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
             `resume` None, or the same as when the training began.
@@ -86,7 +86,8 @@ class Run:
             `resume` means for the schedules.
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
-        phases: Seconds of wall time by what they were spent on: "look" (at the capture, for the effects), "load", "warm up", "steps", "write" and "evaluate".
+        phases: Seconds of wall time by what they were spent on: "look" (at what the capture calls for), "load",
+            "warm up", "steps", "write" and "evaluate".
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.

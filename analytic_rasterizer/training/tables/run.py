@@ -95,7 +95,8 @@ def run_table(
             if missing:
                 skipped.append(missing)
                 continue
-            values = preset_values(preset, table.options["scales"]) | {"effects": "none"} | changes | table.training_options(row, scene)
+            values = preset_values(preset, table.options["scales"]) | changes | table.training_options(row, scene)
+            values["effects"] = "none"
             folder = Path(out) / table.training / row.name / scene
             jobs.append(Job(row, scene, place, folder, TrainingOptions(**values)))
     skipped = list(dict.fromkeys(skipped))
