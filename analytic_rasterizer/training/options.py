@@ -106,8 +106,8 @@ class TrainingOptions:
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
-        effects: "auto": `Run` looks at the capture first, by `plan_capture`, and takes the options that it calls for; not
-            those that differ from their default here, or are among its `chosen`. "none": nobody looks at the capture.
+        effects: "auto": `Run` looks at the capture first, by `plan_capture`, and takes what it calls for; not options
+            that differ from their default here, or are among its `chosen`. "none": nobody looks at the capture.
         exposure: "affine": learn a colour correction (3x4) for each training photograph, for captures whose exposure or
             white balance varies. It is applied before the loss; the scene has no correction. "none": none.
         seed: Of the starting points, the order of the pictures, and everything else that is drawn; -2^39 to 2^40 - 1.
