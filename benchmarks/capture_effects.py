@@ -16,9 +16,6 @@ Photographs for the test are the same in both copies: those of the capture, clea
 how good a scene is if their exposure were another one. The table has their PSNR as they are, and after the best affine
 map of the colours of each picture, which forgives a scene with another mean exposure; both with ± over seeds.
 
-A capture without points, such as lego, has no evidence of exposure, where every reconstruction would have points. Its
-copies have some: the middles of opaque Gaussians of a short training (`--point-steps`) on the clean photographs.
-
 Photographs must be those of pinholes. Needs `pip install ".[train]"`.
 """
 
@@ -33,16 +30,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from common import has_cuda
 from lens_training import frame_of, write_points
 from PIL import Image, ImageFilter
-from torch import Tensor
 
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.gaussians import SH_C0
 from analytic_rasterizer.io.common import BACKGROUNDS
 from analytic_rasterizer.training import Capture, Run, TrainingOptions, evaluate, extent_of, load_capture, load_pictures
 from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
@@ -50,7 +44,6 @@ from analytic_rasterizer.training.files import write_json
 
 FAR = 1000  # extents, at which the camera is that is thrown far away
 GAMMA = 2.2  # of stored values, nearly
-MOST_POINTS = 30_000  # for captures without
 BLUR = 2.0  # px, radius
 
 
@@ -84,7 +77,6 @@ def main() -> None:
     add("--balance", type=float, default=10.0, metavar="PERCENT", help="of red over green, and of green over blue")
     add("--masked", type=float, default=0.1, metavar="SHARE", help="of the pixels of each photograph")
     add("--blurred", type=float, default=0.0, metavar="SHARE", help="of the photographs")
-    add("--point-steps", type=int, default=1000, help="of the training that gives points to a capture without")
     add("--reduce", type=int, default=1, help="photographs are made so many times smaller")
     add("--device", choices=("cpu", "cuda"), default="cuda" if has_cuda() else "cpu")
     args = parser.parse_args()
@@ -150,26 +142,9 @@ def write_copies(folder: Path, out: Path, args: argparse.Namespace) -> str:
     capture = load_capture(folder, lens="refuse", masks="none", offset=(0.0, 0.0, 0.0))
     background = "white" if capture.background == BACKGROUNDS["white"] else "black"
     shutil.rmtree(out, ignore_errors=True)
-    write_copy(out / "clean", capture, args, spoiled=False)
-    if capture.points is None:
-        options = TrainingOptions(
-            iterations=args.point_steps, random_points=MOST_POINTS, effects="none", background=background
-        )
-        run = Run(out / "clean", out / "points", options, device=args.device, save_every=0)
-        run.train()
-        capture = capture._replace(points=points_of(run))
-        write_points(out / "clean" / "sparse_pc.ply", *capture.points)
-    write_copy(out / "spoiled", capture, args, spoiled=True)
+    for name in ("clean", "spoiled"):
+        write_copy(out / name, capture, args, name == "spoiled")
     return background
-
-
-def points_of(run: Run) -> tuple[Tensor, Tensor]:
-    """Middles and colours of opaque Gaussians, in the world."""
-    scene = run.trainer.scene().map(Tensor.cpu)
-    rows = (scene.opacities[:, 0] > 0.5).nonzero()[:, 0]
-    rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]]
-    offset = torch.tensor(run.capture.offset or (0.0, 0.0, 0.0), dtype=torch.float64)
-    return scene.means[rows].double() + offset, (0.5 + SH_C0 * scene.shs[rows, 0]).clamp(0, 1)
 
 
 def write_copy(folder: Path, capture: Capture, args: argparse.Namespace, spoiled: bool) -> None:
