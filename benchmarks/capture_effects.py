@@ -16,6 +16,9 @@ Photographs for the test are the same in both copies: those of the capture, clea
 how good a scene is if their exposure were another one. The table has their PSNR as they are, and after the best affine
 map of the colours of each picture, which forgives a scene with another mean exposure; both with ± over seeds.
 
+Pictures with alpha, such as lego's, are on black, as is usual for these files. White behind them would be the same in
+every photograph, whatever its exposure, which an affine map of all colours does not bring together with the object.
+
 Photographs must be those of pinholes. Needs `pip install ".[train]"`.
 """
 
@@ -37,7 +40,6 @@ from PIL import Image, ImageFilter
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.io.common import BACKGROUNDS
 from analytic_rasterizer.training import Capture, Run, TrainingOptions, evaluate, extent_of, load_capture, load_pictures
 from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
 from analytic_rasterizer.training.files import write_json
@@ -82,14 +84,14 @@ def main() -> None:
     args = parser.parse_args()
     measured: list[dict[str, Any]] = []
     for folder in args.captures:
-        background = write_copies(folder, args.out / folder.name, args)
+        write_copies(folder, args.out / folder.name, args)
         for seed in args.seeds:
             for footprint in args.footprints:
                 for name in args.rows:
                     common = {"capture": folder.name, "footprint": footprint, "seed": seed, "row": name}
                     values = {"iterations": args.iterations, "footprint": footprint, "seed": seed}
                     out = args.out / folder.name / f"{name.replace(', ', '_').replace(' ', '_')}_{footprint}_{seed}"
-                    options = TrainingOptions(**values, effects=ROWS[name].effects, background=background)
+                    options = TrainingOptions(**values, effects=ROWS[name].effects)
                     measured.append(common | train(args.out / folder.name, out, ROWS[name], options, args.device))
                     print(measured[-1], flush=True)
                     report = {"machine": describe_machine(args.device), "arguments": vars(args), "runs": measured}
@@ -102,7 +104,7 @@ def train(copies: Path, out: Path, row: Row, options: TrainingOptions, device: s
     shutil.rmtree(out, ignore_errors=True)
     run = Run(copies / row.copy, out, options, device=device, masks=row.masks, save_every=0)
     run.train()
-    test = load_pictures(run.capture.test, (1,), BACKGROUNDS[options.background], device)
+    test = load_pictures(run.capture.test, (1,), run.capture.background, device)
     found = evaluate(run.trainer.scene(), test, options.footprint, color_corrected=True)["mean"]
     numbers = {name: found[name] for name in ("psnr", COLOR_CORRECTED)}
     return numbers | run.summary() | {"look_s": run.phases["look"], "taken": run.source["taken"]}
@@ -137,14 +139,12 @@ def _spread(values: list[float]) -> str:
 # ------------------------------------------------------------------------------------ copies
 
 
-def write_copies(folder: Path, out: Path, args: argparse.Namespace) -> str:
-    """Writes the folders "clean" and "spoiled". Returns the background of the capture."""
+def write_copies(folder: Path, out: Path, args: argparse.Namespace) -> None:
+    """Writes the folders "clean" and "spoiled"."""
     capture = load_capture(folder, lens="refuse", masks="none", offset=(0.0, 0.0, 0.0))
-    background = "white" if capture.background == BACKGROUNDS["white"] else "black"
     shutil.rmtree(out, ignore_errors=True)
     for name in ("clean", "spoiled"):
         write_copy(out / name, capture, args, name == "spoiled")
-    return background
 
 
 def write_copy(folder: Path, capture: Capture, args: argparse.Namespace, spoiled: bool) -> None:
