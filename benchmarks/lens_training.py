@@ -127,23 +127,33 @@ def write_capture(folder: Path, train: list[tuple], test: list[tuple], points: T
     (folder / "images").mkdir(parents=True, exist_ok=True)
     frames, pool = [], ThreadPoolExecutor()
     for view, picture, members in (*train, *test):
-        c2w = torch.linalg.inv(view.w2c)
-        c2w[:3, 1:3] *= -1
-        cx, cy = view.middle
-        size = {"w": view.width, "h": view.height, "fl_x": view.fx, "fl_y": view.fy, "cx": cx, "cy": cy}
         name = f"images/{view.name}.png"
-        frames.append({"file_path": name, "transform_matrix": c2w.tolist(), **size, **members})
+        frames.append(frame_of(view, name) | members)
         pool.submit(Image.fromarray(picture.permute(1, 2, 0).numpy()).save, folder / name)
     pool.shutdown()
     names = {f"{split}_filenames": [f"images/{item[0].name}.png" for item in items]
              for split, items in (("train", train), ("test", test))}  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps({"frames": frames, **names}))
+    write_points(folder / "sparse_pc.ply", points, colors)
+
+
+def frame_of(view: io.View, name: str) -> dict:
+    """A view and the name of its picture as nerfstudio's transforms.json has them."""
+    c2w = torch.linalg.inv(view.w2c)
+    c2w[:3, 1:3] *= -1
+    cx, cy = view.middle
+    size = {"w": view.width, "h": view.height, "fl_x": view.fx, "fl_y": view.fy, "cx": cx, "cy": cy}
+    return {"file_path": name, "transform_matrix": c2w.tolist(), **size}
+
+
+def write_points(path: Path, points: Tensor, colors: Tensor) -> None:
+    """Points (P, 3) and their colours (P, 3), 0 to 1."""
     rows = torch.cat([points, (255 * colors).round()], 1).tolist()
     header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}"]
     header += [f"property {kind} {name}" for kind, names in (("float", "xyz"), ("uchar", ("red", "green", "blue")))
                for name in names]  # fmt: skip
     lines = [f"{x:.9g} {y:.9g} {z:.9g} {r:.0f} {g:.0f} {b:.0f}" for x, y, z, r, g, b in rows]
-    (folder / "sparse_pc.ply").write_text("\n".join([*header, "end_header", *lines, ""]))
+    path.write_text("\n".join([*header, "end_header", *lines, ""]))
 
 
 def main() -> None:
@@ -188,7 +198,11 @@ def main() -> None:
     for name, lens in (("pinhole", "keep"), ("opencv", "keep"), ("opencv", "undistort"), ("fisheye", "keep")):
         for seed in args.seeds:
             options = training.TrainingOptions(
-                iterations=args.iterations, footprint=args.footprint, seed=seed, background=args.background
+                iterations=args.iterations,
+                footprint=args.footprint,
+                seed=seed,
+                background=args.background,
+                effects="none",
             )
             out = args.out / f"{name}_{lens}_{seed}"
             run = training.Run(args.out / name, out, options, device=args.device, lens=lens)

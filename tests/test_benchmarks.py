@@ -13,6 +13,7 @@ import sys
 import types
 from typing import Any, NamedTuple
 
+import numpy as np
 import pages
 import pytest
 import scenes
@@ -803,3 +804,39 @@ def test_large_capture(tmp_path, monkeypatch, capsys):
         pixels = numpy.array(image.open(item.files[1]))[at[within, 1], at[within, 0]] / 255
         error = abs(pixels - colors[within].numpy()).mean()
         assert within.sum() > 50 and error < 0.05 < abs(pixels - pixels.mean(0)).mean()
+
+
+def test_capture_effects(tmp_path, monkeypatch, capsys):
+    """Copies have what their docstring says, and every training a row. The numbers mean nothing."""
+    pytest.importorskip("tqdm", reason="needs the train extra")
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    training = importlib.import_module("analytic_rasterizer.training")
+    test_plan, effects = (importlib.import_module(name) for name in ("test_plan", "capture_effects"))
+    test_plan.write_wall(tmp_path / "wall")
+    options = ["--iterations", "2", "--device", "cpu", "--stops", "0.8", "--balance", "0", "--footprints", "box"]
+    arguments = ["capture_effects.py", str(tmp_path / "wall"), "--out", str(tmp_path / "out"), *options]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.warns(UserWarning, match="train_0004.png is left out"):
+        effects.main()
+    table = capsys.readouterr().out
+    runs = json.loads((tmp_path / "out" / "results.json").read_text())["runs"]
+    assert [run["row"] for run in runs] == list(effects.ROWS) and all(f" {name} " in table for name in effects.ROWS)
+    taken = {run["row"]: run["taken"] for run in runs}
+    assert taken["spoiled, auto"] == {"exposure": "affine", "masks": "auto"} and taken["clean, auto"] == {}
+    assert taken["spoiled"] == {} and all(math.isfinite(run["psnr"]) for run in runs)
+    clean, spoiled = (training.load_capture(tmp_path / "out" / "wall" / name) for name in ("clean", "spoiled"))
+    assert (len(clean.train), len(spoiled.train), len(spoiled.test)) == (8, 7, 2)
+    pixels = {path: np.asarray(image.open(path), dtype=float) for item in (*clean.train, *clean.test, *spoiled.train)
+              for path in item.files.values()}  # fmt: skip
+    for item in clean.test:
+        path = spoiled.test[0].files[1].with_name(item.files[1].name)
+        assert path.read_bytes() == item.files[1].read_bytes()
+    whole = {item.files[1].name: item for item in clean.train}
+    factors = []
+    for item in spoiled.train:
+        kept = np.asarray(image.open(item.mask)) > 0
+        assert 1 - kept.mean() == pytest.approx(0.1, abs=0.01)
+        before, after = pixels[whole[item.files[1].name].files[1]][kept], pixels[item.files[1]][kept]
+        factors.append(after.mean() / before.mean())
+    assert min(factors) < 0.85 and max(factors) > 1.15

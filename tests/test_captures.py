@@ -1079,12 +1079,19 @@ def test_a_checkpoint_without_an_offset_stays_in_the_world(tmp_path):
         training.Run(tmp_path / "far", tmp_path / "out", resume=True, lens="refuse")
 
 
+def notes_of(said: str) -> list[str]:
+    """What a training says after the lines of its effects and before those of its steps."""
+    lines = [line for line in said.splitlines() if "step" not in line]
+    last = next(place for place, line in enumerate(lines) if line.startswith("--effects auto takes"))
+    return lines[last + 1 :]
+
+
 def test_what_was_chosen_is_said(tmp_path, capsys):
     """Each in a line, by the training and by the test."""
     write(tmp_path / "scene", "SIMPLE_RADIAL", [-0.1])
     (tmp_path / "scene" / "sparse" / "0" / "points3D.bin").unlink()
     assert train(tmp_path / "scene", tmp_path / "kept", "--iterations", "1", "--random-points", "50") == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
+    said = notes_of(capsys.readouterr().err)
     assert len(said) == 2 and re.search(EXACT % "perspective", said[0])
     assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
     assert cli.main(["evaluate", str(tmp_path / "kept"), "--lpips", "none", "--pictures", "0"]) == 0
@@ -1092,7 +1099,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     assert re.search(EXACT % "perspective", capsys.readouterr().err)
     options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
     assert train(tmp_path / "scene", tmp_path / "out", *options) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
+    said = notes_of(capsys.readouterr().err)
     assert len(said) == 2 and re.search(RESAMPLED % "perspective", said[0])
     assert said[1] == "no points in the capture: starts from 50 random ones in the views (--points)"
     assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0

@@ -410,3 +410,44 @@ def test_real_photographs_with_effects(monkeypatch):
     noise = max(EXPOSURE[False])  # without tracks
     assert found["exposure"].verdict == YES and found["exposure"].number == pytest.approx(0.5, abs=noise)
     assert set(found["blur"].photographs) == blurred and len(blurred) == 2
+
+
+def lights(count: int, uneven: float) -> tuple:
+    """Evidence of an object without points in photographs from all around, directions of the cameras, and stops."""
+    generator = torch.Generator().manual_seed(1)
+    axes = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    usual = -2 + axes @ torch.tensor([[0.4, 0.3, 0.5], [0.2, 0.1, 0.0], [1.0, 0.9, 0.7]], dtype=torch.float64)
+    usual += 0.3 * axes[:, :1] * axes[:, 1:2]
+    stops = uneven * (torch.arange(count) % 2 - 0.5)[:, None] * torch.tensor([1.0, 1.0, 0.5], dtype=torch.float64)
+    none, seen = torch.zeros(0, dtype=torch.float64), torch.ones(count, dtype=torch.bool)
+    rows = (none.long(), none.long(), none, none, none, none, none, none.long(), seen)
+    return evidence.Evidence(count, 0, *rows, light=2 ** (usual + stops)), axes, stops
+
+
+def test_exposure_of_an_object_without_points():
+    found, axes, stops = lights(60, 0.6)
+    assert (evidence.object_stops(found, axes) - stops).abs().median() < 0.1
+    assert evidence.object_stops(lights(60, 0.0)[0], axes).abs().max() < 1e-9
+    opaque = found._replace(transparent=torch.arange(60) > 0)
+    for unknown, directions in ((opaque, axes), (lights(20, 0.6)[0], axes[:20])):
+        assert evidence.object_stops(unknown, directions).isnan().all()
+
+
+@pytest.mark.parametrize("gain, verdict", [(1.0, NO), (2.0, YES)])
+def test_a_cut_out_object_with_uneven_exposure(tmp_path, gain, verdict):
+    """Which has no points, as NeRF-synthetic's."""
+    (tmp_path / "train").mkdir()
+    disk = 255.0 * (np.hypot(*np.mgrid[-12:12, -12:12]) < 9)[..., None]
+    frames = []
+    for i in range(42):
+        light = 0.15 * (gain if i % 2 else 1.0) * (1 + 0.3 * math.sin(0.15 * i)) * np.ones((24, 24, 3))
+        pixels = np.concatenate([255 * stored(light), disk], 2).round().astype(np.uint8)
+        image.fromarray(pixels).save(tmp_path / "train" / f"r_{i}.png")
+        pose = torch.linalg.inv(looking_at_origin(0.15 * i))
+        pose[:3, 1:3] *= -1
+        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": pose.tolist()})
+    content = {"camera_angle_x": 2 * math.atan(0.5), "frames": frames}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    found = plan_of(tmp_path)
+    assert (found["exposure"].verdict, found["white balance"].verdict) == (verdict, NO)
+    assert found["exposure"].number == pytest.approx(math.log2(gain) / 2, abs=0.05)

@@ -460,9 +460,8 @@ def test_the_command_prints_the_table_and_measures_lpips_as_the_paper_did(blende
     assert "[1/1] box, lego" in captured.err
     assert "Departs from the protocol: preset quick, iterations = 1, seed = 4." in captured.out
     options = json.loads((tmp_path / "out" / "blender-single" / "box" / "lego" / files.OPTIONS).read_text())["options"]
-    quick = replace(
-        TrainingOptions.preset("quick"), iterations=1, seed=4, footprint="box:samples=4", downsampling="blender"
-    )
+    protocol = {"footprint": "box:samples=4", "downsampling": "blender", "effects": "none"}
+    quick = replace(TrainingOptions.preset("quick"), iterations=1, seed=4, **protocol)
     assert TrainingOptions.from_dict(options) == quick
     # With the network there, another call measures it, and trains nothing.
     asked = []

@@ -63,6 +63,8 @@ MAIN = {
     "background": f"{', '.join(BACKGROUNDS)} or {RANDOM_BACKGROUND} (default: white for NeRF-synthetic scenes, else "
     "black)",
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
+    "effects": "auto: look at SCENE first, as `inspect SCENE` does, and take the options that it calls for, but for "
+    "those that are given; none: do not look",
     "seed": "of everything that is drawn",
     "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
     "deterministic": "the same bits in every run on CUDA too, also after a sudden rise of pairs; slower, for the host "

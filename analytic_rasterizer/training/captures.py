@@ -241,7 +241,8 @@ def without_outliers(folder: Path, capture: Capture) -> Capture:
 
     A wrong pose teaches nothing, and would spoil the mean of a test.
     """
-    items = [*capture.train, *capture.test]
+    # By name, so that they are the same for every choice of the test, and for `plan_capture`.
+    items = sorted([*capture.train, *capture.test], key=lambda item: str(item.files[1]))
     points = None if capture.points is None else capture.points[0]
     outliers = outliers_of([item.view for item in items], points)
     for place, distance in outliers.items():
@@ -250,9 +251,9 @@ def without_outliers(folder: Path, capture: Capture) -> Capture:
             f"cameras, more than {OUTLYING} times as far as all others, so that its pose must be wrong",
             stacklevel=3,
         )
-    kept = [item for place, item in enumerate(items) if place not in outliers]
-    count = sum(place not in outliers for place in range(len(capture.train)))
-    return capture._replace(train=kept[:count], test=kept[count:])
+    far = {items[place].files[1] for place in outliers}
+    train, test = ([item for item in split if item.files[1] not in far] for split in (capture.train, capture.test))
+    return capture._replace(train=train, test=test)
 
 
 def _warn_of_near(

@@ -23,6 +23,7 @@ MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and point
 READERS = 8  # threads, each of which holds a whole picture for a moment
 LEAST_SEEN = 3  # photographs that see a point: of two nobody knows which is the odd one
 LEAST_COMMON = 20  # points that a photograph shares with others: its median is then right to a third of their spread
+LEAST_AROUND = 40  # photographs of an object, whose nine numbers of what is usual are then known
 ROUNDS = 5  # of medians in turn; where photographs overlap, the first three do nearly all
 
 # A point is visible where it is about as near as the nearest point in a cell.
@@ -53,6 +54,7 @@ class Evidence(NamedTuple):
             world units, over the photographs that can see it.
         seen: (points,) int64, how many photographs can see it.
         transparent: (count,) bool, whether a picture has pixels that are not opaque.
+        light: (count, 3) float64, mean light of the opaque pixels; NaN where there are none, or there are points.
     """
 
     count: int
@@ -66,6 +68,7 @@ class Evidence(NamedTuple):
     farthest: Tensor
     seen: Tensor
     transparent: Tensor
+    light: Tensor
 
 
 def spread_out(items: Sequence, most: int) -> list:
@@ -115,6 +118,7 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         farthest=farthest,
         seen=seen,
         transparent=torch.tensor([look.transparent for look in looks]),
+        light=torch.stack([look.light for look in looks]),
     )
 
 
@@ -126,19 +130,21 @@ class _Look(NamedTuple):
     intervals: Tensor  # (V,) sizes of a pixel there
     observed: Tensor  # (O,) the points whose pixels are measured
     sampled: Tensor  # (O, 7) of `_sampled`
+    light: Tensor  # (3,) mean of the opaque pixels, without points
 
 
 def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Tensor]) -> _Look:
     rgba = read_file(item.files[1], LARGEST).rgba
     transparent = bool((rgba[:, :, 3] < 255).any())
     none = torch.zeros(0, dtype=torch.int64)
-    if not len(points):
-        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7))
     planes = rgba.permute(2, 0, 1)[None].float() / 255
     if item.mask is not None:  # what does not count is not looked at
         planes[0, 3] *= read_mask(item.mask, rgba.shape[1], rgba.shape[0]).float() / 255
     reduction = -(-max(rgba.shape[:2]) // LARGEST)
     planes = functional.avg_pool2d(planes, reduction) if reduction > 1 else planes
+    if not len(points):
+        light = _linear(planes[0, :3, planes[0, 3] == 1].double()).mean(1)
+        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7), light)
     height, width = planes.shape[2:]
     view = item.view.resized(width, height)
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
@@ -154,7 +160,8 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     sampled = _sampled(planes, pixels[observed])
     opaque = sampled[:, 6] == 1
     intervals = depth[visible] / math.sqrt(view.fx * view.fy)
-    return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque])
+    unknown = points.new_full((3,), math.nan)
+    return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque], unknown)
 
 
 def _in_front(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
@@ -219,6 +226,24 @@ def stops_of(evidence: Evidence) -> Tensor:
             kept &= deviations < OUTLYING
             logs, photograph, point = logs[kept], photograph[kept], point[kept]
     return offsets
+
+
+def object_stops(evidence: Evidence, axes: Tensor) -> Tensor:
+    """(count, 3): how much brighter than from its direction is usual each photograph shows a cut-out object, in powers
+    of two of mean light. What is usual is a polynomial of the direction, which lights from all sides make smooth.
+
+    NaN where that is not known: where there are few photographs, or some that are opaque everywhere.
+
+    Args:
+        axes: (count, 3), directions in which the cameras look, of length 1.
+    """
+    logs = evidence.light.log2()
+    known = logs.isfinite().all(1) & evidence.transparent
+    if known.sum() < LEAST_AROUND or not known.all():
+        return torch.full_like(logs, math.nan)
+    x, y, z = axes.double().unbind(1)
+    terms = torch.stack([torch.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x], 1)
+    return logs - terms @ torch.linalg.pinv(terms) @ logs
 
 
 def sharpness_of(evidence: Evidence) -> Tensor:

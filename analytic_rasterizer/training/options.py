@@ -12,6 +12,7 @@ from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.common import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
+EFFECTS = ("auto", "none")
 EXPOSURES = ("none", "affine")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 RANDOM_BACKGROUND = "random"
@@ -33,6 +34,7 @@ PRESETS = {
     "quick": Preset({"iterations": 7000}),
     "3dgs": Preset(
         {
+            "effects": "none",
             "density": "3dgs",
             "gradient_scales": "all",
             "densify_until": 0.5,
@@ -104,6 +106,8 @@ class TrainingOptions:
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
+        effects: "auto": `Run` looks at the capture first, by `plan_capture`, and takes what it calls for; not options
+            that differ from their default here, or are among its `chosen`. "none": nobody looks at the capture.
         exposure: "affine": learn a colour correction (3x4) for each training photograph, for captures whose exposure or
             white balance varies. It is applied before the loss; the scene has no correction. "none": none.
         seed: Of the starting points, the order of the pictures, and everything else that is drawn; -2^39 to 2^40 - 1.
@@ -169,6 +173,7 @@ class TrainingOptions:
     sh_every: int = 1000
     background: str = ""
     filter_3d: bool = False
+    effects: str = "auto"
     exposure: str = "none"
     seed: int = 0
     random_points: int = 0
@@ -230,6 +235,7 @@ class TrainingOptions:
         _check("background", self.background in known, f"one of {', '.join(known[1:])}", self.background)
         expected = f"one of {', '.join(DOWNSAMPLINGS)}"
         _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
+        _check("effects", self.effects in EFFECTS, f"one of {', '.join(EFFECTS)}", self.effects)
         _check("exposure", self.exposure in EXPOSURES, f"one of {', '.join(EXPOSURES)}", self.exposure)
         _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
         limited = self.density != "mcmc" or self.max_gaussians > 0
@@ -293,4 +299,4 @@ class TrainingOptions:
         unknown = set(values) - {field.name for field in fields(cls)}
         if unknown:
             raise ValueError(f"options must be among those of TrainingOptions, got {', '.join(sorted(unknown))}")
-        return cls(**values)
+        return cls(**({"effects": "none"} | values))  # of earlier versions, which looked at no capture

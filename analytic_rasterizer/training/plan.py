@@ -22,6 +22,7 @@ from .evidence import (
     Evidence,
     gather,
     interval_ranges,
+    object_stops,
     sharpness_of,
     spread_out,
     stops_of,
@@ -159,7 +160,7 @@ def plan_capture(
     evidence = gather(looked_at, points, tracks)
     findings = (
         _lens(items),
-        *_colors(evidence, bool(tracks)),
+        *_colors(evidence, bool(tracks), looked_at),
         *_intervals(evidence, kept),
         _blur(evidence, looked_at),
         _masks(capture, items),
@@ -263,9 +264,13 @@ def _why_unknown(evidence: Evidence) -> str:
     return f"too few points are in {LEAST_SEEN} photographs that were looked at"
 
 
-def _colors(evidence: Evidence, tracked: bool) -> tuple[Finding, Finding]:
+def _colors(evidence: Evidence, tracked: bool, items: list[Photograph]) -> tuple[Finding, Finding]:
     units = {"exposure": "stops", "white balance": "%"}
+    how, source = "at the same points", "tracks" if tracked else "projected points"
     stops = stops_of(evidence)
+    if not evidence.points:
+        how, source = "of what is usual from their direction", "mean light of an object"
+        stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in items]))
     known = stops.isfinite().all(1)
     count = int(known.sum())
     if count < LEAST_SEEN:
@@ -276,14 +281,15 @@ def _colors(evidence: Evidence, tracked: bool) -> tuple[Finding, Finding]:
     balance = _spread(stops - exposures).max().item()
     numbers = {"exposure": _spread(exposures).item(), "white balance": 100 * (2**balance - 1)}
     limits = {"exposure": EXPOSURE[tracked], "white balance": WHITE_BALANCE[tracked]}
-    source = "tracks" if tracked else "projected points"
     found = []
     for effect, number in numbers.items():
         noise, least = limits[effect]
         verdict = YES if number > least else NO if number <= noise else NOT_KNOWN
-        reason = f"to either side of the middle, at the same points ({count} photographs, {source})"
+        reason = f"to either side of the middle, {how} ({count} photographs, {source})"
         if verdict == NOT_KNOWN:
-            reason += "; without tracks this may be hidden points"
+            reason += (
+                f"; without {'tracks this may be hidden points' if evidence.points else 'points this may be gloss'}"
+            )
         option = "--exposure affine" if verdict == YES else ""
         found.append(Finding(effect, number, units[effect], verdict, option, reason))
     return tuple(found)

@@ -18,6 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
+from .automatic import said_first, settle
 from .captures import Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
@@ -64,7 +65,8 @@ class Run:
     Args:
         scene: Folder of a capture, see `load_capture`.
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
-        options: None: the defaults, or with `resume` those of the checkpoint.
+        options: None: the defaults, or with `resume` those of the checkpoint. With their `effects` "auto", the default,
+            a training that begins has what the capture calls for in `Run.options`, and says so on stderr.
         device: "cpu", "cuda" or "cuda:N".
         images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
             `resume` None, or the same as when the training began.
@@ -78,7 +80,8 @@ class Run:
         memory: How much of it pictures may take, see `PictureMemory`; the bits are the same. None: shares of what is
             free. The test gets what the training has left of limits.
         tensorboard: Write the numbers of the log for TensorBoard too, to the folder "tensorboard" in `out`.
-        chosen: Names of options that somebody chose, for whom one without effect is an error.
+        chosen: Names of options that somebody chose, for whom one without effect is an error. The effects leave them as
+            they are.
         ranks: The processes that train together, each with a part of the Gaussians.
 
     Attributes:
@@ -86,7 +89,8 @@ class Run:
             `resume` means for the schedules.
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
-        phases: Seconds of wall time by what they were spent on: "load", "warm up", "steps", "write" and "evaluate".
+        phases: Seconds of wall time by what they were spent on: "look" (at what the capture calls for), "load",
+            "warm up", "steps", "write" and "evaluate".
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.
@@ -133,22 +137,30 @@ class Run:
         self.options = options or TrainingOptions()
         if ranks.world > 1 and self.options.exposure != "none":
             raise ValueError(f"exposure must be none for {ranks.world} processes, got {self.options.exposure}")
-        # Where the scene is, from wherever `evaluate` is called.
+        if tensorboard:
+            io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
+        self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
         given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
-        self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
-        self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
-        self.source["offset"] = self.capture.offset
-        self.notes = list(self.capture.notes)
-        if state is None:  # raises before the pictures are read
-            check_source(Path(scene), self.capture, self.source, chosen)
-            start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
-            if points is None and self.capture.points is None and self.capture.starts_in_view:
-                self.notes.append(
-                    f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
-                )
-        else:
-            start, self.points_found = Gaussians(**state["gaussians"]), None
+        taken, lines, later = {} if state is None else state["source"].get("taken", {}), [], []
+        if state is None and self.options.effects == "auto":
+            with self._phase("look"):
+                self.options, given, taken, lines, later = settle(scene, self.options, given, chosen, ranks)
+        # Where the scene is, from wherever `evaluate` is called.
+        self.source = {"scene": os.path.abspath(scene), **source_of(given, state), "taken": taken}
+        with said_first(lines):
+            self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
+            self.source["offset"] = self.capture.offset
+            self.notes = [*later, *self.capture.notes]
+            if state is None:  # raises before the pictures are read
+                check_source(Path(scene), self.capture, self.source, chosen)
+                start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
+                if points is None and self.capture.points is None and self.capture.starts_in_view:
+                    self.notes.append(
+                        f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
+                    )
+            else:
+                start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
         pictures = self._load(self.capture.train, background, self.memory)
         if pictures.store.plan.ahead:
@@ -176,7 +188,7 @@ class Run:
         self.log = Log(self.out / LOG, self.history)
         self.board = TensorBoard(self.out, self.progress.step) if tensorboard else None
         results_folder(self.out)
-        self.phases = {"load": time.perf_counter() - began, "warm up": 0.0, "steps": 0.0, "write": 0.0, "evaluate": 0.0}
+        self.phases["load"] = time.perf_counter() - began - self.phases["look"]
 
     @property
     def progress(self):

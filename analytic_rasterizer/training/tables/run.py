@@ -27,7 +27,7 @@ from .protocols import Row, Table
 from .report import Results, as_dict, markdown
 
 # What makes a row what it is.
-FIXED = ("footprint", "scales", "scale_repeats", "downsampling", "filter_3d", "supersampling")
+FIXED = ("effects", "footprint", "scales", "scale_repeats", "downsampling", "filter_3d", "supersampling")
 
 
 class Job(NamedTuple):
@@ -96,6 +96,7 @@ def run_table(
                 skipped.append(missing)
                 continue
             values = preset_values(preset, table.options["scales"]) | changes | table.training_options(row, scene)
+            values["effects"] = "none"
             folder = Path(out) / table.training / row.name / scene
             jobs.append(Job(row, scene, place, folder, TrainingOptions(**values)))
     skipped = list(dict.fromkeys(skipped))

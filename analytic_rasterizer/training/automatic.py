@@ -1,0 +1,106 @@
+"""`effects` of `TrainingOptions`: what a training takes of what its capture calls for, where nobody chose otherwise."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+from ..distributed.ranks import Ranks
+from .captures import IMAGES
+from .options import TrainingOptions
+from .plan import CapturePlan, plan_capture
+
+
+class Settled(NamedTuple):
+    """A training after a look at its capture.
+
+    Attributes:
+        options: With what was taken.
+        given: Arguments of `Run` by name, as chosen or taken; None: as is usual.
+        taken: Values by the names of options: what the plan decided.
+        lines: What to say of it. The first lines of a training, and none on other ranks than the first.
+        notes: What to say later: that the capture could not be looked at.
+    """
+
+    options: TrainingOptions
+    given: dict[str, Any]
+    taken: dict[str, Any]
+    lines: list[str]
+    notes: list[str]
+
+
+def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Collection[str], ranks: Ranks) -> Settled:
+    """Looks at the capture, on the first rank, and takes what it calls for.
+
+    Args:
+        scene: Folder of the capture.
+        options: Those that differ from their defaults were chosen.
+        given: Arguments of `Run` by name; None: nobody chose.
+        chosen: Names of options that were chosen too, whatever their values.
+    """
+    plan = ranks.from_first(_look(scene, given) if ranks.is_first else None)
+    if isinstance(plan, str):
+        return Settled(options, given, {}, [], [f"{scene}: not looked at, --effects auto takes nothing: {plan}"])
+    defaults = {field.name: field.default for field in fields(TrainingOptions)}
+    values = {name: _value(text, defaults.get(name)) for name, text in plan.options.items()}
+    kept = [
+        name
+        for name in values
+        if name in chosen or (given[name] is not None if name in given else getattr(options, name) != defaults[name])
+    ]
+    alone = [] if ranks.world == 1 or "exposure" in kept else ["exposure"]  # which several ranks cannot learn
+    taken = {name: value for name, value in values.items() if name not in (*kept, *alone)}
+    changes = {name: value for name, value in taken.items() if name not in given}
+    if "scales" in changes:
+        changes["scale_repeats"] = ()  # as is usual for these
+    given = given | {name: value for name, value in taken.items() if name in given}
+    lines = []
+    if ranks.is_first:
+        lines = [*plan.to_lines(), f"--effects auto takes {_shown(taken, plan) or 'nothing'}"]
+        left = _shown([name for name in kept if str(_of(options, given, name)) != str(values[name])], plan)
+        if left:
+            lines[-1] += f", and not {left}: another value is given"
+        if set(alone) & set(values):
+            lines[-1] += f", and not {_shown(alone, plan)}, which {ranks.world} processes cannot learn: train on one"
+    return Settled(replace(options, **changes), given, taken, lines, [])
+
+
+@contextmanager
+def said_first(lines: list[str]) -> Iterator[None]:
+    """Says the lines on stderr when the block is done, before its warnings; none after an error of the block."""
+    if not lines:
+        yield
+        return
+    caught = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            yield
+        for line in lines:
+            print(line, file=sys.stderr, flush=True)
+    finally:
+        for warning in caught:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+
+
+def _look(scene, given: dict[str, Any]) -> CapturePlan | str:
+    """The plan, or why there is none: what is wrong with a capture is for its loader to say, and a look is no need."""
+    try:
+        return plan_capture(scene, given["images"] or IMAGES, cameras=given["cameras"])
+    except Exception as error:
+        return str(error) or type(error).__name__
+
+
+def _value(text: str, default: Any) -> Any:
+    return tuple(map(int, text.split(","))) if isinstance(default, tuple) else text
+
+
+def _of(options: TrainingOptions, given: dict[str, Any], name: str) -> Any:
+    return given[name] if name in given else getattr(options, name)
+
+
+def _shown(names: Collection[str], plan: CapturePlan) -> str:
+    return " ".join(f"--{name} {plan.options[name]}" for name in names)

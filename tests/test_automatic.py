@@ -1,0 +1,188 @@
+"""`--effects`: what a training takes of what its capture calls for, by itself."""
+
+import json
+import shutil
+import warnings
+
+import pytest
+import torch
+
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+pytest.importorskip("tqdm", reason="needs the train extra")
+pytest.importorskip("scipy", reason="needs the train extra")
+
+from capture_files import circle, write_nerf_synthetic  # noqa: E402
+from test_plan import cameras, write_wall  # noqa: E402
+
+from analytic_rasterizer import cli, io, training  # noqa: E402
+from analytic_rasterizer.distributed.ranks import Ranks  # noqa: E402
+from analytic_rasterizer.training import TrainingOptions, automatic, files, plan  # noqa: E402
+
+TINY = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300, "density": "none"}
+WORDS = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
+
+
+@pytest.fixture(scope="module")
+def even(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("even") / "wall")
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """Every second photograph is one stop brighter."""
+    return write_wall(tmp_path_factory.mktemp("uneven") / "wall", gains=lambda i: (2 ** (0.5 - i % 2),) * 3)
+
+
+def train(folder, out, *options) -> int:
+    arguments = ["train", str(folder), "--out", str(out), "--device", "cpu", "--iterations", "3", *WORDS]
+    return cli.main([*arguments, *map(str, options)])
+
+
+def described(out) -> dict:
+    return json.loads((out / files.OPTIONS).read_text())
+
+
+def settle(folder, options=None, given=None, chosen=(), ranks=None):
+    reading = dict.fromkeys(("images", "cameras", "lens", "missing", "masks", "alpha")) | (given or {})
+    return automatic.settle(folder, options or TrainingOptions(), reading, chosen, ranks or Ranks())
+
+
+def test_an_uneven_capture_is_trained_with_corrections(uneven, tmp_path, capsys):
+    """By itself, and test and resumption know it."""
+    assert train(uneven, tmp_path) == 0
+    shown = capsys.readouterr()
+    first = plan.plan_capture(uneven).to_lines()
+    assert shown.err.splitlines()[: len(first) + 1] == [*first, "--effects auto takes --exposure affine"]
+    assert "after the best affine colour" in shown.out
+    found = described(tmp_path)
+    assert (found["options"]["exposure"], found["options"]["effects"]) == ("affine", "auto")
+    assert found["source"]["taken"] == {"exposure": "affine"}
+    assert (tmp_path / files.EXPOSURES).exists()
+    assert cli.main(["evaluate", str(tmp_path), "--lpips", "none", "--pictures", "0"]) == 0
+    assert "best affine colour" in capsys.readouterr().out
+
+
+def test_a_resumed_training_does_not_look_again(uneven, tmp_path, capsys, monkeypatch):
+    assert train(uneven, tmp_path, "--no-evaluate") == 0
+    capsys.readouterr()
+    monkeypatch.setattr(automatic, "plan_capture", None)
+    arguments = ["train", str(uneven), "--out", str(tmp_path), "--device", "cpu", "--resume", "--no-evaluate"]
+    assert cli.main([*arguments, "--iterations", "5"]) == 0
+    assert "--effects" not in capsys.readouterr().err
+    assert described(tmp_path)["options"]["exposure"] == "affine"
+    assert described(tmp_path)["source"]["taken"] == {"exposure": "affine"}
+    for option, value in (("effects", "none"), ("exposure", "none")):
+        assert cli.main([*arguments, f"--{option}", value]) == 2
+        assert f"--{option}: a resumed training keeps the options" in capsys.readouterr().err
+
+
+def test_none_does_not_look(uneven, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(automatic, "plan_capture", None)
+    assert train(uneven, tmp_path / "none", "--effects", "none", "--no-evaluate") == 0
+    assert not capsys.readouterr().err.startswith(str(uneven))
+    assert described(tmp_path / "none")["options"]["exposure"] == "none"
+    assert TrainingOptions.preset("3dgs").effects == "none"  # for comparisons
+
+
+def test_a_switch_wins(uneven, tmp_path, capsys):
+    """Also that of the default."""
+    assert train(uneven, tmp_path / "out", "--exposure", "none", "--no-evaluate") == 0
+    line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("--effects"))
+    assert line == "--effects auto takes nothing, and not --exposure affine: another value is given"
+    assert described(tmp_path / "out")["options"]["exposure"] == "none"
+    settled = settle(uneven, TrainingOptions(exposure="affine"))
+    assert (settled.taken, settled.options.exposure) == ({}, "affine")
+    assert settled.lines[-1] == "--effects auto takes nothing"
+
+
+def test_a_capture_without_evidence_trains_to_the_same_bits(even, tmp_path):
+    scenes = []
+    for effects in ("auto", "none"):
+        run = training.Run(even, tmp_path / effects, TrainingOptions(**TINY, effects=effects, iterations=20))
+        run.train()
+        scenes.append(io.load_scene(tmp_path / effects / files.SCENE))
+        assert described(tmp_path / effects)["source"]["taken"] == {}
+    assert all(torch.equal(a, b) for a, b in zip(*scenes))
+
+
+def test_scales_that_photographs_call_for(tmp_path):
+    """With as many repeats as are usual."""
+    views = cameras(lambda i: 4.0 if i % 2 else 19.0)
+    settled = settle(write_wall(tmp_path, views))
+    assert settled.taken == {"scales": (1, 2, 4, 8)} and settled.given["lens"] is None
+    assert settled.options == TrainingOptions(scales=(1, 2, 4, 8))
+    assert settle(tmp_path, TrainingOptions(scales=(1, 2))).taken == {}
+    assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions()
+
+
+def test_missing_pictures_and_cameras_far_away(tmp_path, capsys):
+    """The lines agree with what happens."""
+    views = cameras()
+    far = views[4].w2c.clone()
+    far[2, 3] += 1000
+    write_wall(tmp_path / "wall", [*views[:4], io.View(**vars(views[4]) | {"w2c": far}), *views[5:]])
+    (tmp_path / "wall" / "images" / "p_7.png").unlink()
+    with pytest.warns(UserWarning, match="p_4.png is left out"):
+        assert train(tmp_path / "wall", tmp_path / "out") == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith(f"{tmp_path / 'wall'}: looked at 8 of 9")
+    assert "--effects auto takes --missing skip" in lines
+    assert any(line.startswith("outlying cameras yes") and "p_4.png" in line for line in lines)
+    assert described(tmp_path / "out")["source"]["missing"] == "skip"
+    assert train(tmp_path / "wall", tmp_path / "refused", "--missing", "refuse") == 2
+    error = capsys.readouterr().err
+    assert "1 of 9 pictures are missing" in error and error.count("\n") == 1
+
+
+def test_a_capture_that_cannot_be_looked_at(even, tmp_path, capsys, monkeypatch):
+    """Its loader says what is wrong, if anything is."""
+    shutil.copytree(even, tmp_path / "wall")
+    (tmp_path / "wall" / "images" / "p_3.png").write_bytes(b"no picture")
+    assert train(tmp_path / "wall", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "p_3.png: unreadable" in error and error.count("\n") == 1
+
+    def fail(*args, **options):
+        raise RuntimeError("a look went wrong")
+
+    monkeypatch.setattr(automatic, "plan_capture", fail)
+    assert train(even, tmp_path / "trained", "--no-evaluate") == 0
+    assert f"{even}: not looked at, --effects auto takes nothing: a look went wrong" in capsys.readouterr().err
+
+
+def test_errors_and_warnings_around_the_lines(capsys):
+    """Warnings are not lost with an error, lines are not said."""
+    with pytest.warns(UserWarning, match="careful"), automatic.said_first(["a line"]):
+        warnings.warn("careful", stacklevel=1)
+        assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == "a line\n"
+    with pytest.warns(UserWarning, match="careful"), pytest.raises(ValueError), automatic.said_first(["a line"]):
+        warnings.warn("careful", stacklevel=1)
+        raise ValueError
+    assert capsys.readouterr().err == ""
+
+
+class _Several(Ranks):
+    """Two processes, as far as one of them can tell."""
+
+    heard: dict = {}  # noqa: RUF012
+
+    def exchange(self, value):
+        if self.is_first:
+            self.heard["value"] = value
+        return [self.heard["value"], value]
+
+
+def test_several_processes_take_what_the_first_finds(uneven, monkeypatch):
+    first = settle(uneven, ranks=_Several(0, 2))
+    monkeypatch.setattr(automatic, "plan_capture", None)
+    second = settle(uneven, ranks=_Several(1, 2))
+    assert first.options == second.options == TrainingOptions() and first.taken == second.taken == {}
+    assert second.lines == []
+    expected = "--effects auto takes nothing, and not --exposure affine, which 2 processes cannot learn: train on one"
+    assert first.lines[-1] == expected
+
+
+def test_a_capture_without_points_takes_nothing(tmp_path):
+    write_nerf_synthetic(tmp_path, circle(6), circle(2))
+    assert settle(tmp_path).taken == {}
