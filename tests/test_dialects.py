@@ -1017,8 +1017,8 @@ def test_compiled_module_of_another_that_was_left_behind(tmp_path):
 
 
 def test_a_new_dialect_is_one_file(tmp_path):
-    """The file of docs/dialects.md, put into the package, is a dialect: by choice and by inference."""
-    text = (ROOT / "docs" / "dialects.md").read_text()
+    """The file of its page, put into the package, is a dialect: by choice and by inference."""
+    text = (ROOT / "docs" / "internals" / "adding-a-dialect.md").read_text()
     source = text.split("```python\n# analytic_rasterizer/dialects/confident.py\n")[1].split("```")[0]
     installed(tmp_path)
     (tmp_path / "analytic_rasterizer" / "dialects" / "confident.py").write_text(source)
