@@ -117,7 +117,8 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
     shutil.copytree(synthetic, folder)
     breaks, message = BROKEN[case]
     breaks(folder)
-    assert cli.main(["train", str(folder), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    options = ["--device", "cpu", "--missing", "refuse", "--iterations", "1"]
+    assert cli.main(["train", str(folder), "--out", str(tmp_path / "out"), *options]) == 2
     error = capsys.readouterr().err
     assert re.search(message, error) and error.startswith("error: ") and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -134,7 +135,7 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--scales", "1,1"], "scales must be different from each other"),
         (["--scales", "1,2", "--scale-repeats", "1"], "scale_repeats must be 2 numbers"),
         (["--scales", "one"], "must be whole numbers with commas between them, got one"),
-        (["--scales", "64"], "32 x 32 px are too few for these scales"),
+        (["--scales", "64", "--effects", "none"], "32 x 32 px are too few for these scales"),
         (["--density", "more"], "density must be one of 3dgs, absgrad, mcmc, none, got more"),
         (
             ["--densify-until", "1.5"],

@@ -177,7 +177,8 @@ def _sampled(planes: Tensor, pixels: Tensor) -> Tensor:
     """(N, 7) float64 at pixels (N, 2) of planes (1, 4, H, W): columns of `Evidence` from `color` to `bands`, and
     whether all around is opaque."""
     colors = _around(planes[:, :3], pixels, WINDOW)
-    mean, variance = colors.mean(2), colors.var(2, unbiased=False).mean(1)
+    mean = colors.mean(2)
+    variance = (colors - mean[:, :, None]).square().mean((1, 2))
     roughness = variance.sqrt() / mean.mean(1).clamp_min(DARKEST)
     grey = planes[:, :3].mean(1, keepdim=True)
     # Binomial filters of variance 1 and 4 px^2.
