@@ -17,9 +17,8 @@ from analytic_rasterizer.io.gltf import NAME
 
 VALIDATE = """
 const validator = require('gltf-validator'), files = require('fs');
-const options = {uri: process.argv[1]};
-validator.validateBytes(new Uint8Array(files.readFileSync(process.argv[1])), options)
-  .then((report) => console.log(JSON.stringify(report.issues)));
+validator.validateBytes(new Uint8Array(files.readFileSync(process.argv[1])))
+  .then((report) => console.log(JSON.stringify(report.issues.messages)));
 """
 
 
@@ -61,7 +60,7 @@ def test_a_scene_comes_back_to_float32(tmp_path, name, degree):
 
 def picture(scene, camera):
     """Pictures of 40 x 30 pixels from the (4, 4) matrix from world to camera."""
-    view = io.View("a", 40, 30, 40.0, 40.0, 20.0, 15.0, camera)
+    view = io.View("a", 40, 30, 40.0, 40.0, camera)
     settings = view.settings(sh_degree=scene.sh_degree, footprint="moment:samples=4")
     return ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())[0]
 
@@ -107,12 +106,12 @@ def test_what_a_node_turns_looks_the_same_from_the_turned_camera(tmp_path, way):
     assert (before - wrong).abs().max() > 0.01  # harmonics as they were are seen
 
 
-def by_hand(**accessors):
-    """A .gltf of two Gaussians with rows of 32 bytes, whose scales, quaternions and opacities are integers."""
+def by_hand():
+    """A .gltf of two Gaussians, and its buffer: a stride of 32 bytes, and numbers as integers."""
     row = struct.Struct("<3f3f2s")
     rows = b"".join(row.pack(i, 2, 3, 0.5, 0, -0.5, b"\0\0") + bytes(6) for i in range(2))
-    small = struct.pack("<4b4bHH4b4b", 0, 0, 0, 127, 127, 0, 0, -128, 65535 // 5, 65535, 127, 64, 1, 0, 127, 127, 127, 0)
-    data = rows + small
+    quaternions, opacities, scales = (0, 0, 0, 127, 127, 0, 0, -128), (13107, 65535), (127, 64, 1, 0, 127, 127, 127, 0)
+    data = rows + struct.pack("<8b2H8b", *quaternions, *opacities, *scales)
     kinds = {
         "POSITION": (0, 0, 5126, "VEC3", False),
         f"{NAME}:SH_DEGREE_0_COEF_0": (0, 12, 5126, "VEC3", False),
@@ -157,10 +156,11 @@ def test_a_file_of_another_program(tmp_path, where):
     assert abs(found.rotations[0] @ half) == 1  # the identity, turned
 
 
+SPZ = f"{NAME}_compression_spz_2"
 REFUSED = {
     "compressed": (
-        lambda c: c["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={f"{NAME}_compression_spz_2": {}}),
-        "compression_spz_2 is not read",
+        lambda c: c["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={SPZ: {}}),
+        f"{SPZ} is not read",
     ),
     "required": (lambda c: c.update(extensionsRequired=["EXT_x"]), "EXT_x is not read"),
     "packed": (lambda c: c["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}), "meshopt"),
@@ -179,13 +179,17 @@ REFUSED = {
     "no node": (lambda c: c.update(scenes=[{"nodes": [-1]}]), r"no nodes\[-1\]"),
     "version": (lambda c: c["asset"].update(version="1.0"), "expected glTF 2"),
     "huge": (lambda c: c["accessors"][0].update(count=1 << 40), "cut short"),
-    "long": (lambda c: c["bufferViews"][0].update(byteLength=1 << 50), "attributes|cut short|expected"),
+    "beyond": (
+        lambda c: (c["bufferViews"][0].update(byteLength=1 << 50), c["accessors"][0].update(count=9)),
+        "cut short",
+    ),
     "narrow": (lambda c: c["bufferViews"][0].update(byteStride=0), "cut short"),
     "negative": (lambda c: c["accessors"][0].update(byteOffset=-4), "natural number"),
     "buffer": (lambda c: c["buffers"][0].update(byteLength=1 << 40), "cut short: buffers"),
     "above": (lambda c: c["buffers"][0].update(uri="../a.bin"), "beside it"),
     "nowhere": (lambda c: c["buffers"][0].update(uri="https://a.b/c.bin"), "beside it"),
     "types": (lambda c: c["accessors"][0].update(type=[]), "expected VEC3"),
+    "claimed": (lambda c: c["buffers"].append({"byteLength": 1 << 50}), r"cut short: buffers\[1\] has 0"),
     "many": (lambda c: c.update(nodes=9 * [{"mesh": 0}]), "too many"),
 }
 
@@ -193,8 +197,6 @@ REFUSED = {
 @pytest.mark.parametrize("change, message", REFUSED.values(), ids=REFUSED)
 def test_what_is_refused(tmp_path, change, message):
     content, _ = by_hand()
-    if message.startswith("attributes"):  # a view that says more than there is, and an accessor that believes it
-        content["accessors"][0]["count"] = 1 << 30
     change(content)
     refused(tmp_path / "a.gltf", content, message)
 
@@ -219,11 +221,19 @@ def test_what_a_gltf_does_not_hold(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.gltf"])
-def test_the_validator_of_khronos_finds_nothing(tmp_path, name):
+def test_the_validator_of_khronos_finds_only_the_extension_that_it_does_not_know(tmp_path, name):
     node = shutil.which("node")
     if node is None or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
         pytest.skip("needs node, and npm's gltf-validator in NODE_PATH")
-    io.save_scene(tmp_path / name, random_scene(), io.SceneMetadata(footprint="moment"))
-    found = subprocess.run([node, "-e", VALIDATE, str(tmp_path / name)], capture_output=True, text=True, check=True)
-    issues = json.loads(found.stdout)
-    assert issues["numErrors"] == 0 and issues["numWarnings"] == 0, issues
+    path = tmp_path / name
+    io.save_scene(path, random_scene(), io.SceneMetadata(footprint="moment"))
+
+    def codes():
+        found = subprocess.run([node, "-e", VALIDATE, str(path)], capture_output=True, text=True, check=True)
+        return [(message["code"], message["pointer"].rpartition("/")[2]) for message in json.loads(found.stdout)]
+
+    unknown = [("UNSUPPORTED_EXTENSION", "0")]
+    assert [each for each in codes() if not each[1].startswith(f"{NAME}:")] == unknown
+    # 2.0.0-dev.3.10 does not know the extension, and takes no names with a colon: the same file without them passes.
+    path.write_bytes(path.read_bytes().replace(f"{NAME}:".encode(), f"_{NAME[1:]}_".encode()))
+    assert codes() == unknown

@@ -274,7 +274,7 @@ POINT_CLOUD = ["x", "y", "z", "nx", "ny", "nz"]
     [
         (lambda d: d / "none.ply", "no such file"),
         (lambda d: d, "expected a file of a scene, got a folder"),
-        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got '.obj'"),
+        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got"),
         (lambda d: text_file(d, "a.ply", ""), "does not begin with 'ply'"),
         (lambda d: text_file(d, "a.ply", "plyx\nformat"), "does not begin with 'ply'"),
         (lambda d: text_file(d, "a.ply", "ply\nformat ascii 1.0\n"), "no end_header"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ class _Reader:
             raise SceneError("not a glTF: it has no asset")
         if not str(self.json["asset"].get("version")).startswith("2."):
             raise SceneError(f"expected glTF 2, got version {self.json['asset'].get('version')!r}")
-        self.buffers: dict[int, bytes] = {}
+        self.buffers: dict[str | None, bytes] = {}  # by URI
 
     def _chunks(self, content: bytes) -> bytes:
         """The JSON of a .glb; keeps its binary part."""
@@ -99,13 +100,12 @@ class _Reader:
         if not shown:
             raise SceneError(f"its scene shows no Gaussians: no mesh has the extension {NAME}")
         rows = sum(_natural(self._item("accessors", each["attributes"]["POSITION"]), "count") for _, each in shown)
-        size = sum(_natural(buffer, "byteLength") for buffer in self.json["buffers"])
-        parts = []
-        for matrix, primitive in shown:
-            parts.append(self._gaussians(primitive))  # the first checks that the buffers are there
-            if rows > size / FEWEST_BYTES:
-                raise SceneError(f"{rows} Gaussians are too many for {size} bytes")
-            parts[-1] = _placed(parts[-1], HALF_TURN @ matrix)
+        for index in range(len(self.json["buffers"])):
+            self._buffer(index)
+        size = sum(map(len, self.buffers.values()))
+        if rows > size / FEWEST_BYTES:
+            raise SceneError(f"cut short: {rows} Gaussians are too many for {size} bytes")
+        parts = [_placed(self._gaussians(primitive), HALF_TURN @ matrix) for matrix, primitive in shown]
         bands = max(part["shs"].shape[1] for part in parts)
         for part in parts:
             part["shs"] = np.pad(part["shs"], ((0, 0), (0, bands - part["shs"].shape[1]), (0, 0)))
@@ -123,9 +123,9 @@ class _Reader:
             roots = self._item("scenes", self.json.get("scene", 0)).get("nodes", [])
         else:
             roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-        waiting, seen = [(np.eye(4), root) for root in roots], set()
+        waiting, seen = deque((np.eye(4), root) for root in roots), set()
         while waiting:
-            above, index = waiting.pop(0)
+            above, index = waiting.popleft()
             node = self._item("nodes", index)
             if index in seen:
                 raise SceneError(f"nodes[{index}] has two parents, or itself above it")
@@ -193,10 +193,10 @@ class _Reader:
 
     def _buffer(self, index: Any) -> bytes:
         entry = self._item("buffers", index)
-        if index not in self.buffers:
-            uri = entry.get("uri")
+        uri = entry.get("uri")
+        if uri not in self.buffers:
             if uri is None:
-                content = self.binary if index == 0 else b""
+                content = self.binary
             elif uri.startswith("data:"):
                 content = base64.b64decode(uri.partition(";base64,")[2], validate=True)
             else:
@@ -204,10 +204,11 @@ class _Reader:
                 if file.name != str(file) or not (self.path.parent / file).is_file():
                     raise SceneError(f"expected a buffer in a file beside it, got {uri!r}")
                 content = (self.path.parent / file).read_bytes()
-            if len(content) < _natural(entry, "byteLength"):
-                raise SceneError(f"cut short: buffers[{index}] has {len(content)} of {entry['byteLength']} bytes")
-            self.buffers[index] = content
-        return self.buffers[index]
+            self.buffers[uri] = content
+        found = self.buffers[uri]
+        if len(found) < _natural(entry, "byteLength"):
+            raise SceneError(f"cut short: buffers[{index}] has {len(found)} of {entry['byteLength']} bytes")
+        return found
 
 
 def _natural(entry: dict[str, Any], name: str, default: int | None = None) -> int:
@@ -247,8 +248,10 @@ def _placed(fields: dict[str, np.ndarray], matrix: np.ndarray) -> dict[str, np.n
     if not error < TOLERANCE or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise SceneError("a node scales its Gaussians differently along axes, or shears them: not read")
     quaternion = quaternion_of(linear / scale)
+    with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out later
+        means = fields["means"] @ linear.T + matrix[:3, 3]
     return {
-        "means": fields["means"] @ linear.T + matrix[:3, 3],
+        "means": means,
         "log_scales": fields["log_scales"] + np.log(scale),
         "rotations": turned_quaternions(quaternion, fields["rotations"]),
         "logit_opacities": fields["logit_opacities"],

@@ -22,8 +22,14 @@ SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range
 PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
 """Properties that a vertex of a 3DGS .ply must have; harmonics beyond the constant follow as f_rest_0, f_rest_1, ..."""
 HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
-WRITTEN = {".ply": "ply", ".ply_compressed": "compressed", ".spz": "spz", ".splat": "splat"}
-WRITTEN |= {".glb": "glb", ".gltf": "gltf"}
+WRITTEN = {
+    ".ply": "ply",
+    ".ply_compressed": "compressed",
+    ".spz": "spz",
+    ".splat": "splat",
+    ".glb": "glb",
+    ".gltf": "gltf",
+}
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
@@ -37,7 +43,8 @@ def load_scene(path, strict: bool = False) -> Gaussians:
 
     Gaussians that have a number that is not finite are left out, and a warning counts them. Another warning says where
     positions of double precision lose what matters in float32. Axes are those stored in the file: tools that make .spz
-    may have turned the scene (y and z negated), and nothing in the file says so. A glTF is y-up, and is turned to y-down.
+    may have turned the scene (y and z negated), and nothing in the file says so. A glTF is y-up, and is
+    turned to y-down.
 
     Args:
         path: The file. Its suffix, in any case, says which format it has.
@@ -52,8 +59,13 @@ def load_scene(path, strict: bool = False) -> Gaussians:
         ImportError: The extra `cli` is missing, which formats other than .ply, .splat and glTF need.
     """
     path, kind = scene_file(path)
-    readers = {"ply": _read_ply, "spz": spz.read_spz, "sog": sog.read_sog, "splat": splat.read_splat}
-    readers["gltf"] = gltf.read_gltf
+    readers = {
+        "ply": _read_ply,
+        "spz": spz.read_spz,
+        "sog": sog.read_sog,
+        "splat": splat.read_splat,
+        "gltf": gltf.read_gltf,
+    }
     try:
         fields = readers[kind](path)
     except OSError as error:
@@ -161,7 +173,9 @@ def written_format(path) -> str:
     if path.name.lower().endswith(".compressed.ply"):
         return "compressed"
     if path.suffix.lower() not in WRITTEN:
-        raise SceneError(f"{path}: expected a .ply, .spz, .splat, .glb or .gltf name, got {path.suffix or 'no suffix'!r}")
+        raise SceneError(
+            f"{path}: expected a .ply, .spz, .splat, .glb or .gltf name, got {path.suffix or 'no suffix'!r}"
+        )
     return WRITTEN[path.suffix.lower()]
 
 
@@ -179,8 +193,8 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
 
     Raises:
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
-            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata that cannot be written; in all formats but .ply numbers that are
-            not finite, and in an .spz means beyond 2^22.
+            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata that cannot be written; in
+            all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
     """

@@ -10,9 +10,14 @@ SAMPLES = 64  # directions, more than the 16 harmonics
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     """The unit quaternion of a (3, 3) rotation, the nearest one where it is only nearly that (Bar-Itzhack)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
-    upper = [[a + e + i, h - f, c - g, d - b], [0, a - e - i, b + d, c + g], [0, 0, e - a - i, f + h], [0, 0, 0, i - a - e]]
+    upper = [
+        [a + e + i, h - f, c - g, d - b],
+        [0, a - e - i, b + d, c + g],
+        [0, 0, e - a - i, f + h],
+        [0, 0, 0, i - a - e],
+    ]
     found = np.linalg.eigh(np.array(upper), UPLO="U")[1][:, -1]
-    return found * np.sign(found[np.abs(found).argmax()])
+    return found * np.sign(found[np.abs(found).argmax()])  # one of both signs, always the same
 
 
 def turned_quaternions(by: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -49,7 +54,13 @@ def _basis(directions: np.ndarray) -> np.ndarray:
         [
             np.ones_like(x),
             *(-y, z, -x),
-            *(2 * root(3) * x * y, -2 * root(3) * y * z, 3 * z * z - 1, -2 * root(3) * x * z, root(3) * (x * x - y * y)),
+            *(
+                2 * root(3) * x * y,
+                -2 * root(3) * y * z,
+                3 * z * z - 1,
+                -2 * root(3) * x * z,
+                root(3) * (x * x - y * y),
+            ),
             -root(10) / 4 * y * (3 * x * x - y * y),
             root(15) * x * y * z,
             -root(6) / 4 * y * (5 * z * z - 1),
