@@ -70,7 +70,7 @@ def test_a_ply_comes_back_to_the_bit(tmp_path):
     torch.testing.assert_close(kept, torch.tensor([13.8155, -13.8155]), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["a.compressed.ply", "a.spz", "a.splat"])
+@pytest.mark.parametrize("name", ["a.compressed.ply", "a.spz", "a.splat", "a.glb"])
 def test_scales_of_zero_and_zero_quaternions_spoil_nothing(tmp_path, name):
     """In a compressed .ply a logarithm of -inf made NaN of the scales of 256 Gaussians."""
     scene = random_scene(degree=0)
@@ -397,7 +397,7 @@ def test_compressed_scenes_that_cannot_be_read(tmp_path, change, message):
 
 # ------------------------------------------------------------------------ what a scene says of itself
 
-HOLDING = ["a.ply", "a.compressed.ply", "a.spz"]
+HOLDING = ["a.ply", "a.compressed.ply", "a.spz", "a.glb", "a.gltf"]
 METADATA = {
     "nothing": io.SceneMetadata(),
     "trained with moment": io.SceneMetadata(footprint="moment:samples=16"),

@@ -225,7 +225,7 @@ def test_scenes_with_gradients_are_saved(tmp_path):
 
 
 def test_save_scene_refuses_other_suffixes(tmp_path):
-    with pytest.raises(io.SceneError, match=r"expected a \.ply, \.spz or \.splat name, got '\.obj'"):
+    with pytest.raises(io.SceneError, match=r"expected a \.ply, \.spz, \.splat, \.glb or \.gltf name, got '\.obj'"):
         io.save_scene(tmp_path / "scene.obj", random_scene())
 
 
@@ -274,7 +274,7 @@ POINT_CLOUD = ["x", "y", "z", "nx", "ny", "nz"]
     [
         (lambda d: d / "none.ply", "no such file"),
         (lambda d: d, "expected a file of a scene, got a folder"),
-        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog or .splat file, got '.obj'"),
+        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got"),
         (lambda d: text_file(d, "a.ply", ""), "does not begin with 'ply'"),
         (lambda d: text_file(d, "a.ply", "plyx\nformat"), "does not begin with 'ply'"),
         (lambda d: text_file(d, "a.ply", "ply\nformat ascii 1.0\n"), "no end_header"),

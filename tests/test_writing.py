@@ -48,6 +48,7 @@ WRITERS = {
     "a.ply": lambda path: io.save_scene(path, scene()),
     "a.compressed.ply": lambda path: io.save_scene(path, scene()),
     "a.spz": lambda path: io.save_scene(path, scene(), io.SceneMetadata(footprint="moment")),
+    "a.glb": lambda path: io.save_scene(path, scene()),
     "a.splat": lambda path: io.save_scene(path, scene()),
     "views.json": lambda path: io.save_views(path, views()),
     "picture.png": lambda path: io.save_image(path, torch.rand(3, 64, 64)),

@@ -106,7 +106,8 @@ def add_scene(parser) -> None:
 
 def add_files(parser, purpose: str = "file of views") -> None:
     """SCENE and --views."""
-    scene = "file of a scene (.ply, compressed .ply, .spz, .sog, .splat), or a folder: of `train`, or a model of 3DGS"
+    formats = ".ply, compressed .ply, .spz, .sog, .splat, .glb, .gltf"
+    scene = f"file of a scene ({formats}), or a folder: of `train`, or a model of 3DGS"
     parser.add_argument("scene", metavar="SCENE", help=scene)
     views = f"{purpose}: {VIEWS} (default: cameras.json beside SCENE, or of the model of 3DGS)"
     parser.add_argument("--views", metavar="FILE", help=views)

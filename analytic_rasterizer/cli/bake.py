@@ -36,7 +36,8 @@ def add_parser(subcommands) -> None:
     reduced = "the training's pictures had 1/N of the size in VIEWS (default: what cfg_args or options.json says, or 1)"
     add_scales(parser, reduction, reduced)
     add = parser.add_argument
-    add("--out", required=True, metavar="FILE", help="the scene to write: .ply, .compressed.ply, .spz or .splat")
+    written = ".ply, .compressed.ply, .spz, .splat, .glb or .gltf"
+    add("--out", required=True, metavar="FILE", help=f"the scene to write: {written}")
     add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
     of_training = "of the training, px^2 (default: that of the footprint, 0.3)"
     add("--dilation", type=dilation, metavar="V", help=of_training)

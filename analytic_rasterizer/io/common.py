@@ -43,7 +43,15 @@ def unreadable() -> Iterator[None]:
         raise SceneError(f"unreadable or cut short ({reason})") from None
 
 
-FORMATS = {".ply": "ply", ".ply_compressed": "ply", ".spz": "spz", ".sog": "sog", ".splat": "splat"}
+FORMATS = {
+    ".ply": "ply",
+    ".ply_compressed": "ply",
+    ".spz": "spz",
+    ".sog": "sog",
+    ".splat": "splat",
+    ".glb": "gltf",
+    ".gltf": "gltf",
+}
 """Formats of scenes, by suffix."""
 
 
@@ -59,7 +67,9 @@ def scene_file(path) -> tuple[Path, str]:
         raise SceneError(f"{path}: no such file")
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise SceneError(f"{path}: expected a .ply, .spz, .sog or .splat file, got {path.suffix or 'no suffix'!r}")
+        raise SceneError(
+            f"{path}: expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got {path.suffix or 'no suffix'!r}"
+        )
     return path, FORMATS[suffix]
 
 

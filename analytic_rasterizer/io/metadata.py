@@ -1,6 +1,7 @@
 """Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
 
-A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json. A .splat holds none.
+A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json, a glTF in its
+asset.extras. A .splat holds none.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..footprints import COMPENSATED, DILATED, resolve_footprint
-from . import ply, sog, spz
+from . import gltf, ply, sog, spz
 from .common import first_line, scene_file
 
 OWN = "analytic_rasterizer"  # the first word of lines that only this package reads
@@ -128,6 +129,8 @@ def read_metadata(path) -> SceneMetadata:
         return replace(metadata_of(lines, path), antialiased=antialiased)
     if kind == "sog":
         return SceneMetadata(antialiased=sog.is_antialiased(path))
+    if kind == "gltf":
+        return metadata_of(gltf.read_lines(path), path)
     if kind == "splat":
         return SceneMetadata()
     return metadata_of(ply.read_header(path).comments, path)

@@ -1,4 +1,4 @@
-"""Files of scenes: .ply, compressed .ply, .spz, .sog and .splat."""
+"""Files of scenes: .ply, compressed .ply, .spz, .sog, .splat and glTF."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
-from . import ply, sog, splat, spz
+from . import gltf, ply, sog, splat, spz
 from .common import SceneError, first_line, naming, scene_file
 from .compressed import is_compressed, read_compressed, to_compressed
 from .metadata import SceneMetadata
@@ -22,20 +22,29 @@ SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range
 PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
 """Properties that a vertex of a 3DGS .ply must have; harmonics beyond the constant follow as f_rest_0, f_rest_1, ..."""
 HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
-WRITTEN = {".ply": "ply", ".ply_compressed": "compressed", ".spz": "spz", ".splat": "splat"}
+WRITTEN = {
+    ".ply": "ply",
+    ".ply_compressed": "compressed",
+    ".spz": "spz",
+    ".splat": "splat",
+    ".glb": "glb",
+    ".gltf": "gltf",
+}
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
 
 def load_scene(path, strict: bool = False) -> Gaussians:
-    """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic) or a .splat.
+    """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic), a .splat
+    or a glTF (.glb, .gltf).
 
     A .ply may be text or have either byte order, any types, and any other elements and properties. Red, green and blue
     are read where there are no harmonics, as those of degree 0.
 
     Gaussians that have a number that is not finite are left out, and a warning counts them. Another warning says where
     positions of double precision lose what matters in float32. Axes are those stored in the file: tools that make .spz
-    may have turned the scene (y and z negated), and nothing in the file says so.
+    may have turned the scene (y and z negated), and nothing in the file says so. A glTF is y-up, and is
+    turned to y-down.
 
     Args:
         path: The file. Its suffix, in any case, says which format it has.
@@ -47,10 +56,16 @@ def load_scene(path, strict: bool = False) -> Gaussians:
     Raises:
         SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
             the file.
-        ImportError: The extra `cli` is missing, which formats other than .ply and .splat need.
+        ImportError: The extra `cli` is missing, which formats other than .ply, .splat and glTF need.
     """
     path, kind = scene_file(path)
-    readers = {"ply": _read_ply, "spz": spz.read_spz, "sog": sog.read_sog, "splat": splat.read_splat}
+    readers = {
+        "ply": _read_ply,
+        "spz": spz.read_spz,
+        "sog": sog.read_sog,
+        "splat": splat.read_splat,
+        "gltf": gltf.read_gltf,
+    }
     try:
         fields = readers[kind](path)
     except OSError as error:
@@ -149,7 +164,7 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
 
 
 def written_format(path) -> str:
-    """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz" or "splat".
+    """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz", "splat", "glb" or "gltf".
 
     Raises:
         SceneError: It writes none under this name.
@@ -158,12 +173,14 @@ def written_format(path) -> str:
     if path.name.lower().endswith(".compressed.ply"):
         return "compressed"
     if path.suffix.lower() not in WRITTEN:
-        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
+        raise SceneError(
+            f"{path}: expected a .ply, .spz, .splat, .glb or .gltf name, got {path.suffix or 'no suffix'!r}"
+        )
     return WRITTEN[path.suffix.lower()]
 
 
 def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) -> None:
-    """Writes a scene as .ply, .compressed.ply, .spz (version 3) or .splat, by its name.
+    """Writes a scene as .ply, .compressed.ply, .spz (version 3), .splat, .glb or .gltf, by its name.
 
     A .ply holds the parameters as they are, but for infinite logits: opacities are then kept off 0 and 1 by 1e-6. The
     other formats round (docs/library.md says how), and hold unit quaternions. A .splat has no place for metadata and
@@ -176,8 +193,8 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
 
     Raises:
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
-            harmonics of degree 4 in an .spz; metadata that cannot be written; in all formats but .ply numbers that are
-            not finite, and in an .spz means beyond 2^22.
+            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata that cannot be written; in
+            all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
     """
@@ -204,6 +221,10 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
     if kind == "compressed":
         content = to_compressed(fields, metadata.lines())
         write_safely(path, lambda temporary: temporary.write_bytes(content))
+    elif kind in ("glb", "gltf"):
+        with naming(path):
+            content = gltf.to_gltf(fields, metadata.lines(), kind == "glb")
+        write_safely(path, lambda temporary: temporary.write_bytes(content))
     elif kind == "spz":
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
@@ -223,8 +244,10 @@ def _check(scene: Gaussians, kind: str) -> None:
         field = getattr(scene, name)
         if field.shape != (count, *row):
             raise SceneError(f"{name} must have shape {(count, *row)}, got {tuple(field.shape)}")
-    if scene.sh_degree > 4 or (kind == "spz" and scene.sh_degree > 3):
+    if scene.sh_degree > 4 or (kind in ("spz", "glb", "gltf") and scene.sh_degree > 3):
         raise SceneError(f"harmonics of degree {scene.sh_degree} have no place in this format; a .ply holds degree 4")
+    if kind in ("glb", "gltf") and not count:
+        raise SceneError("a glTF has no place for a scene without Gaussians; a .ply has")
     for name, field in numbers_of(scene).items() if kind != "ply" else ():
         good = field.flatten(1).isfinite().all(1)
         if not good.all():

@@ -1,0 +1,73 @@
+"""Turning Gaussians: quaternions (w, x, y, z), and harmonics up to degree 3 with them, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+
+SAMPLES = 64  # directions, more than the 16 harmonics
+
+
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """The unit quaternion of a (3, 3) rotation, the nearest one where it is only nearly that (Bar-Itzhack)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    upper = [
+        [a + e + i, h - f, c - g, d - b],
+        [0, a - e - i, b + d, c + g],
+        [0, 0, e - a - i, f + h],
+        [0, 0, 0, i - a - e],
+    ]
+    found = np.linalg.eigh(np.array(upper), UPLO="U")[1][:, -1]
+    return found * np.sign(found[np.abs(found).argmax()])  # one of both signs, always the same
+
+
+def turned_quaternions(by: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """The products of `by` (4,) with `rotations` (N, 4)."""
+    w, x, y, z = by
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return rotations @ product.T
+
+
+def turned_harmonics(by: np.ndarray, shs: np.ndarray) -> np.ndarray:
+    """Harmonics (N, K, 3) whose colour in a turned direction is that of `shs` in the direction before."""
+    w, x, y, z = by
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    directions = np.random.default_rng(0).normal(size=(SAMPLES, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    wanted, basis = _basis(directions @ rotation), _basis(directions)
+    turned = shs.astype(np.float64)
+    for degree in range(1, int(np.sqrt(shs.shape[1]))):  # a rotation mixes only those of one degree
+        band = slice(degree**2, (degree + 1) ** 2)
+        matrix = np.linalg.lstsq(basis[:, band], wanted[:, band], rcond=None)[0]
+        rounded = matrix.round()  # half turns only change signs: then to the bit
+        if np.abs(matrix - rounded).max() < 1e-12:
+            matrix = rounded
+        turned[:, band] = np.einsum("ij,njc->nic", matrix, shs[:, band])
+    return turned
+
+
+def _basis(directions: np.ndarray) -> np.ndarray:
+    """The (M, 16) harmonics of 3DGS, each but for a factor that all of its degree share."""
+    x, y, z = directions.T
+    root = np.sqrt
+    return np.stack(
+        [
+            np.ones_like(x),
+            *(-y, z, -x),
+            *(
+                2 * root(3) * x * y,
+                -2 * root(3) * y * z,
+                3 * z * z - 1,
+                -2 * root(3) * x * z,
+                root(3) * (x * x - y * y),
+            ),
+            -root(10) / 4 * y * (3 * x * x - y * y),
+            root(15) * x * y * z,
+            -root(6) / 4 * y * (5 * z * z - 1),
+            z * (5 * z * z - 3) / 2,
+            -root(6) / 4 * x * (5 * z * z - 1),
+            root(15) / 2 * z * (x * x - y * y),
+            -root(10) / 4 * x * (x * x - 3 * y * y),
+        ],
+        1,
+    )
