@@ -224,7 +224,7 @@ def test_what_is_no_file_is_written_directly(tmp_path):
 
 
 DIRECT = re.compile(r"\.write_(text|bytes)\(|savefig\(|\.tofile\(|\.save\(|open\([^)]*\"(r?[wax]b?|rb?\+)\"")
-SAFE = re.compile(r"temporary|\bio\.write_|self\.save\(|/proc/self/clear_refs")
+SAFE = re.compile(r"temporary|in_memory|\bio\.write_|self\.save\(|/proc/self/clear_refs")
 
 
 def test_every_writer_of_the_package_is_safe():

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io as memory
 import warnings
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 from ..io import FoundScene, View, to_image
@@ -44,6 +44,6 @@ def png(item: Photograph, options: TrainingOptions, background: tuple[float, flo
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         pictures = load_pictures([item], options.scales, background, "cpu", options.downsampling)
-    file = memory.BytesIO()
-    to_image(pictures.truth(min(options.scales), 0)[:3]).save(file, "PNG", compress_level=1)
-    return file.getvalue()
+    in_memory = BytesIO()
+    to_image(pictures.truth(min(options.scales), 0)[:3]).save(in_memory, "PNG", compress_level=1)
+    return in_memory.getvalue()
