@@ -125,12 +125,14 @@ class Renderer:
 def write_capture(folder: Path, train: list[tuple], test: list[tuple], points: Tensor, colors: Tensor) -> None:
     """A nerfstudio capture of (view, picture, members of the frame)."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    frames, pool = [], ThreadPoolExecutor()
+    frames, images, paths = [], [], []
     for view, picture, members in (*train, *test):
         name = f"images/{view.name}.png"
         frames.append(frame_of(view, name) | members)
-        pool.submit(Image.fromarray(picture.permute(1, 2, 0).numpy()).save, folder / name)
-    pool.shutdown()
+        images.append(Image.fromarray(picture.permute(1, 2, 0).numpy()))
+        paths.append(folder / name)
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(Image.Image.save, images, paths))  # raises what one of them raises
     names = {f"{split}_filenames": [f"images/{item[0].name}.png" for item in items]
              for split, items in (("train", train), ("test", test))}  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps({"frames": frames, **names}))
