@@ -18,10 +18,18 @@ image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
 from capture_files import looking_at_origin, quaternion, write_colmap_text  # noqa: E402
 
-from analytic_rasterizer.training import colmap, evidence, plan  # noqa: E402
+from analytic_rasterizer.training import automatic, colmap, evidence, plan  # noqa: E402
 from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
 from analytic_rasterizer.training.photographs import Stored  # noqa: E402
-from analytic_rasterizer.training.plan import EXPOSURE, NO, NOT_KNOWN, YES, displacement_of, plan_capture  # noqa: E402
+from analytic_rasterizer.training.plan import (  # noqa: E402
+    EXPOSURE,
+    NO,
+    NOT_KNOWN,
+    YES,
+    displacement_of,
+    plan_capture,
+    stops_of_photographs,
+)
 
 COUNT, SIZE, HALF = 10, (160, 120), 3.0  # photographs, px, half the width of the wall that they show
 
@@ -139,6 +147,26 @@ def test_exposure(tmp_path, tracked):
     assert found["exposure"].number == pytest.approx(0.5, abs=0.03)
     assert found["white balance"].verdict == NO
     assert found["blur"].verdict == NO
+
+
+def test_stops_of_photographs(tmp_path, monkeypatch):
+    folder = write_wall(tmp_path / "wall", gains=lambda i: (2 ** (0.5 - i % 2),) * 3)
+    known = plan_capture(folder).stops
+    files = sorted(known)
+    assert len(files) == COUNT
+    threads = torch.get_num_threads()
+    stops = stops_of_photographs(folder, [*files, tmp_path / "another.png"])
+    assert torch.get_num_threads() == threads
+    assert stops.shape == (COUNT + 1, 3) and stops[-1].isnan().all()
+    expected = 0.5 - torch.arange(COUNT).double() % 2
+    assert torch.allclose(stops[:-1] - stops[:-1].mean(0), expected[:, None].expand(-1, 3), atol=0.05)
+    assert torch.equal(stops[:-1], torch.stack([known[file] for file in files]))
+    # A training that has looked does not look again; what cannot be looked at starts as it is.
+    source = {"images": None, "cameras": None}
+    monkeypatch.setattr(automatic, "stops_of_photographs", lambda *_, **__: pytest.fail("looks"))
+    assert torch.equal(automatic.measured_stops(folder, files, source, known), stops[:-1])
+    monkeypatch.undo()
+    assert automatic.measured_stops(tmp_path / "none", files, source, {}).isnan().all()
 
 
 def test_white_balance(tmp_path):

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
 
 from ..distributed.ranks import Ranks
 from .captures import IMAGES
 from .options import TrainingOptions
-from .plan import CapturePlan, plan_capture
+from .plan import CapturePlan, plan_capture, stops_of_photographs
 
 
 class Settled(NamedTuple):
@@ -24,6 +29,7 @@ class Settled(NamedTuple):
         taken: Values by the names of options: what the plan decided.
         lines: What to say of it. The first lines of a training, and none on other ranks than the first.
         notes: What to say later: that the capture could not be looked at.
+        stops: Of the photographs that were looked at, as of `CapturePlan`.
     """
 
     options: TrainingOptions
@@ -31,6 +37,7 @@ class Settled(NamedTuple):
     taken: dict[str, Any]
     lines: list[str]
     notes: list[str]
+    stops: dict[Path, Tensor]
 
 
 def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Collection[str], ranks: Ranks) -> Settled:
@@ -44,7 +51,7 @@ def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Colle
     """
     plan = ranks.from_first(_look(scene, given) if ranks.is_first else None)
     if isinstance(plan, str):
-        return Settled(options, given, {}, [], [f"{scene}: not looked at, --effects auto takes nothing: {plan}"])
+        return Settled(options, given, {}, [], [f"{scene}: not looked at, --effects auto takes nothing: {plan}"], {})
     defaults = {field.name: field.default for field in fields(TrainingOptions)}
     values = {name: _value(text, defaults.get(name)) for name, text in plan.options.items()}
     kept = [
@@ -66,7 +73,7 @@ def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Colle
             lines[-1] += f", and not {left}: another value is given"
         if set(alone) & set(values):
             lines[-1] += f", and not {_shown(alone, plan)}, which {ranks.world} processes cannot learn: train on one"
-    return Settled(replace(options, **changes), given, taken, lines, [])
+    return Settled(replace(options, **changes), given, taken, lines, [], plan.stops)
 
 
 @contextmanager
@@ -84,6 +91,20 @@ def said_first(lines: list[str]) -> Iterator[None]:
     finally:
         for warning in caught:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+
+
+def measured_stops(scene, files: Sequence[Path], source: dict[str, Any], known: dict[Path, Tensor]) -> Tensor:
+    """(files, 3) of `stops_of_photographs`; NaN where the capture cannot be looked at, as for `settle`.
+
+    Args:
+        known: Of an earlier look; photographs are read only where some are not in it.
+    """
+    if files and all(file in known for file in files):
+        return torch.stack([known[file] for file in files])
+    try:
+        return stops_of_photographs(scene, files, source["images"] or IMAGES, cameras=source["cameras"])
+    except Exception:
+        return torch.full((len(files), 3), math.nan, dtype=torch.float64)
 
 
 def _look(scene, given: dict[str, Any]) -> CapturePlan | str:

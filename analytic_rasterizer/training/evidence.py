@@ -7,8 +7,9 @@ the point has and of what the photograph adds; medians over points and over phot
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -75,6 +76,18 @@ def spread_out(items: Sequence, most: int) -> list:
     """At most `most` of the items, evenly over their order."""
     count = min(len(items), most)
     return [items[i * len(items) // count] for i in range(count)]
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """No operator of torch uses several threads within, in threads that start there either: teams of threads wait for
+    each other wherever processors are busy, as they are while pictures are read."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str, Tensor]) -> Evidence:

@@ -6,9 +6,9 @@ import math
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -24,6 +24,7 @@ from .evidence import (
     interval_ranges,
     object_stops,
     sharpness_of,
+    single_threaded,
     spread_out,
     stops_of,
 )
@@ -91,6 +92,7 @@ class CapturePlan:
         looked_at: How many of them were read.
         findings: One for each effect.
         notes: What was chosen among what the folder holds, as `Capture.notes`.
+        stops: By the paths of the photographs that were read: (3,) of `stops_of_photographs`.
     """
 
     capture: str
@@ -98,6 +100,7 @@ class CapturePlan:
     looked_at: int
     findings: tuple[Finding, ...]
     notes: tuple[str, ...] = ()
+    stops: dict[Path, torch.Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def options(self) -> dict[str, str]:
@@ -116,10 +119,31 @@ class CapturePlan:
         return "\n".join([*self.to_lines(), f"calls for: {options or 'nothing special'}"])
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, as JSON holds it."""
-        return {**asdict(self), "options": self.options}
+        """Everything but `stops`, as JSON holds it."""
+        values = asdict(replace(self, stops={}))
+        del values["stops"]
+        return {**values, "options": self.options}
 
 
+class _Survey(NamedTuple):
+    """What is known of a capture after a look at it."""
+
+    capture: Capture
+    items: list[Photograph]  # all of them
+    outliers: dict[int, float]  # places and distances of outlying cameras
+    kept: list[Photograph]  # the others
+    headers: dict[Path, Header]
+    looked_at: list[Photograph]
+    tracked: bool  # tracks say what is visible
+    evidence: Evidence  # of what was looked at
+    stops: dict[Path, torch.Tensor]  # of what was looked at
+
+    @property
+    def points(self) -> torch.Tensor | None:
+        return None if self.capture.points is None else self.capture.points[0]
+
+
+@single_threaded()
 def plan_capture(
     folder,
     images: str = IMAGES,
@@ -142,6 +166,45 @@ def plan_capture(
     if most < 1:
         raise ValueError(f"most must be at least 1, got {most}")
     folder = Path(folder)
+    found = _survey(folder, images, cameras, most)
+    findings = (
+        _lens(found.items),
+        *_colors(found),
+        *_intervals(found.evidence, found.kept),
+        _blur(found.evidence, found.looked_at),
+        _masks(found.capture, found.items),
+        _alpha(found.evidence, found.looked_at),
+        *_files([(item, found.headers[item.files[1]]) for item in found.items]),
+        _missing(found.capture, folder),
+        _outlying(found.items, found.outliers),
+        _far([item.view for item in found.kept], found.points),
+    )
+    notes = found.capture.notes
+    return CapturePlan(str(folder), len(found.items), len(found.looked_at), findings, notes, found.stops)
+
+
+@single_threaded()
+def stops_of_photographs(
+    folder, files: Sequence[Path], images: str = IMAGES, *, cameras: str | None = None
+) -> torch.Tensor:
+    """(files, 3) float64: how much brighter than the others these photographs are in red, green and blue, in stops.
+
+    NaN where it is not known.
+
+    Args:
+        folder, images, cameras: As of `load_capture`.
+        files: Paths of photographs (`Photograph.files[1]`), all of which are read.
+
+    Raises:
+        io.SceneError, OSError: As `plan_capture`.
+    """
+    found = _survey(Path(folder), images, cameras, len(files), set(files))
+    unknown = torch.full((3,), math.nan, dtype=torch.float64)
+    return torch.stack([found.stops.get(file, unknown) for file in files])
+
+
+def _survey(folder: Path, images: str, cameras: str | None, most: int, among: set[Path] | None = None) -> _Survey:
+    """Reads at most `most` photographs, of all or of those `among` which they are to be."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # findings say it
         capture = read_cameras(folder, images, 0, cameras, "skip")
@@ -153,24 +216,18 @@ def plan_capture(
     with ThreadPoolExecutor() as pool:
         files = [item.files[1] for item in items]
         headers = dict(zip(files, pool.map(read_header, files)))
-    fitting = [item for item in kept if headers[item.files[1]].fits(item.view)]
-    looked_at = spread_out(fitting or kept, most)
+    wanted = [item for item in kept if among is None or item.files[1] in among]
+    fitting = [item for item in wanted if headers[item.files[1]].fits(item.view)]
+    looked_at = spread_out(fitting or wanted, most)
     from_colmap = points is not None and capture.source is not None and capture.source.is_dir()
     tracks = colmap.load_tracks(capture.source) if from_colmap else {}
     evidence = gather(looked_at, points, tracks)
-    findings = (
-        _lens(items),
-        *_colors(evidence, bool(tracks), looked_at),
-        *_intervals(evidence, kept),
-        _blur(evidence, looked_at),
-        _masks(capture, items),
-        _alpha(evidence, looked_at),
-        *_files([(item, headers[item.files[1]]) for item in items]),
-        _missing(capture, folder),
-        _outlying(items, outliers),
-        _far([item.view for item in kept], points),
-    )
-    return CapturePlan(str(folder), len(items), len(looked_at), findings, capture.notes)
+    if evidence.points:
+        stops = stops_of(evidence)
+    else:
+        stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in looked_at]))
+    stops_by_file = dict(zip((item.files[1] for item in looked_at), stops))
+    return _Survey(capture, items, outliers, kept, headers, looked_at, bool(tracks), evidence, stops_by_file)
 
 
 def _unknown(effect: str, unit: str, reason: str) -> Finding:
@@ -264,13 +321,12 @@ def _why_unknown(evidence: Evidence) -> str:
     return f"too few points are in {LEAST_SEEN} photographs that were looked at"
 
 
-def _colors(evidence: Evidence, tracked: bool, items: list[Photograph]) -> tuple[Finding, Finding]:
+def _colors(survey: _Survey) -> tuple[Finding, Finding]:
     units = {"exposure": "stops", "white balance": "%"}
+    evidence, tracked, stops = survey.evidence, survey.tracked, torch.stack(list(survey.stops.values()))
     how, source = "at the same points", "tracks" if tracked else "projected points"
-    stops = stops_of(evidence)
     if not evidence.points:
         how, source = "of what is usual from their direction", "mean light of an object"
-        stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in items]))
     known = stops.isfinite().all(1)
     count = int(known.sum())
     if count < LEAST_SEEN:

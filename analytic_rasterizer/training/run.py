@@ -18,7 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
-from .automatic import said_first, settle
+from .automatic import measured_stops, said_first, settle
 from .captures import Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
@@ -143,9 +143,10 @@ class Run:
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
         given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
         taken, lines, later = {} if state is None else state["source"].get("taken", {}), [], []
+        stops: dict[Path, torch.Tensor] = {}
         if state is None and self.options.effects == "auto":
             with self._phase("look"):
-                self.options, given, taken, lines, later = settle(scene, self.options, given, chosen, ranks)
+                self.options, given, taken, lines, later, stops = settle(scene, self.options, given, chosen, ranks)
         # Where the scene is, from wherever `evaluate` is called.
         self.source = {"scene": os.path.abspath(scene), **source_of(given, state), "taken": taken}
         with said_first(lines):
@@ -175,6 +176,10 @@ class Run:
         else:
             counts = None if state is None else shards_of(state, ranks)
             self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, ranks, counts)
+        if self.trainer.exposures is not None and state is None:
+            files = [item.files[1] for item in self.capture.train]
+            with self._phase("look"):
+                self.trainer.exposures.start(measured_stops(scene, files, self.source, stops))
         self.clock, self.history = Clock(self.device), []
         if state is not None:
             if state["pictures"] != len(pictures.views):
