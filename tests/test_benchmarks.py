@@ -480,6 +480,23 @@ def test_bands_say_what_does_not_fit_whichever_rank_is_heard_of(small_scene, mon
         raise_of_rank("RuntimeError: something else")
 
 
+def test_formats(small_scene, monkeypatch, capsys):
+    """A row for every format and for the file of another program; what rounds less shows less."""
+    benchmark, scene_files = importlib.import_module("formats"), importlib.import_module("scene_files")
+    io.save_scene(small_scene / "other.ply", scene_files.load_scene(small_scene / "scene.npz"))
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
+    options = ["--also", str(small_scene / "other.ply"), "--device", "cpu", "--footprint", "box:samples=1"]
+    monkeypatch.setattr(sys, "argv", ["formats.py", *map(str, arguments), *options])
+    benchmark.main()
+    table = capsys.readouterr().out
+    results = {row["file"]: row for row in json.loads((small_scene / "out.json").read_text())["results"]}
+    assert list(results) == [*(f"scene.{suffix}" for suffix in benchmark.FORMATS), "other.ply"]
+    assert all(f"| {name.removeprefix('scene')} |" in table for name in results)
+    assert results["scene.ply"]["psnr"] == results["other.ply"]["psnr"] == 300
+    assert results["scene.glb"]["psnr"] > 100 > results["scene.spz"]["psnr"] > results["scene.splat"]["psnr"] > 10
+    assert results["scene.glb"]["rotations"][0] < 1e-4 < 0.01 < results["scene.spz"]["rotations"][0] < 0.3
+
+
 def test_approximations(small_scene, monkeypatch, capsys):
     """The program's first picture is the library's, and what is approximated changes it (no ray of it is dark)."""
     benchmark = importlib.import_module("approximations")

@@ -50,6 +50,94 @@ def close(found, wanted, turned=1e-4):
     assert (found.shs - wanted.shs).abs().max() < 0.04
 
 
+def smallest_three(error):
+    """By how many radians a rotation errs at most if each of the three smaller components errs by `error`.
+
+    The largest follows from them: w = sqrt(1 - r^2) with r^2 <= 3/4, so that it errs by r / w times as much as r does,
+    which is at most 2 (and a little more, for the r that was read may lie beyond). Quaternions that are d apart are
+    rotations that are 4 asin(d / 2) apart.
+    """
+    three = math.sqrt(3) * error
+    r = math.sqrt(3) / 2 + three
+    return 4 * math.asin(math.hypot(three, three * r / math.sqrt(1 - r * r)) / 2)
+
+
+def in_chunks(values, steps):
+    """(N, 3) half a step of each axis, between the limits of every 256 Gaussians."""
+    half = [torch.stack([chunk.min(0)[0], chunk.max(0)[0]]).diff(dim=0).expand_as(chunk) for chunk in values.split(256)]
+    return torch.cat(half) / (2 * torch.tensor(steps))
+
+
+def steps_of(name, scene):
+    """The largest errors of a format for numbers within its limits: half a step between those that it holds.
+
+    Bits and limits are those of its description. Rotations in radians; `base` is the harmonic of degree 0.
+    """
+    if name == "a.compressed.ply":  # 11, 10 and 11 bits between limits, 8 of colours; 10 from -1/sqrt(2) to 1/sqrt(2)
+        return {
+            "means": in_chunks(scene.means, [2047, 1023, 2047]),
+            "log_scales": in_chunks(scene.log_scales, [2047, 1023, 2047]),
+            "rotations": smallest_three(math.sqrt(2) / 1023 / 2),
+            "opacities": 1 / 255 / 2,
+            "base": in_chunks(scene.shs[:, 0], [255, 255, 255]),
+            "rest": 8 / 256 / 2,
+        }
+    if name == "a.spz":  # version 3: 12 fractional bits; 9 bits from 0 to 1/sqrt(2)
+        return {
+            "means": 2**-12 / 2,
+            "log_scales": 1 / 16 / 2,
+            "rotations": smallest_three(1 / math.sqrt(2) / 511 / 2),
+            "opacities": 1 / 255 / 2,
+            "base": 1 / (0.15 * 255) / 2,
+            "rest": 1 / 128 / 2,
+        }
+    if name == "a.sog":  # as sog_file writes it, with codebooks of equal steps
+        logs = scene.means.sign() * scene.means.abs().log1p()
+        span = lambda values: (values.max() - values.min()).item()  # noqa: E731
+        half = (logs.max(0)[0] - logs.min(0)[0]) / 65535 / 2
+        half += 2**-22 * logs.abs().max()  # 16 bits are so many that four roundings of a logarithm in float32 count
+        return {
+            "means": (scene.means.abs() + 1) * half.expm1(),
+            "log_scales": span(scene.log_scales) / 255 / 2,
+            "rotations": smallest_three(math.sqrt(2) / 255 / 2),
+            "opacities": 1 / 255 / 2,
+            "base": span(scene.shs[:, 0]) / 255 / 2,
+            "rest": span(scene.shs[:, 1:]) / 255 / 2,
+        }
+    # .splat: 4 components in steps of 1/128, each wrong by half of one, on a sphere.
+    turned = 2 * math.asin(math.sqrt(4) / 128 / 2)
+    return {"rotations": turned, "opacities": 1 / 255 / 2, "base": 1 / (255 * 0.28209479177387814) / 2}
+
+
+ROUNDED = 1 + 2**-10
+"""Half a step, and what float32 adds: a number of up to 2^11 steps, by four roundings of 2^-24, is 2^-11 steps off."""
+
+
+@pytest.mark.parametrize("name", ["a.compressed.ply", "a.spz", "a.sog", "a.splat"])
+def test_errors_are_half_a_step_of_the_format(tmp_path, name):
+    """And not much less, so that a step that is twice as large is noticed."""
+    scene, path = random_scene(2000), tmp_path / name
+    if name == "a.sog":
+        path.write_bytes(sog_file(scene))
+    else:
+        if name == "a.splat":
+            scene = scene._replace(shs=scene.shs[:, :1])
+        io.save_scene(path, scene)
+    found = io.load_scene(path, strict=True)
+    unit, other = (torch.nn.functional.normalize(s.rotations.double(), dim=1) for s in (found, scene))
+    apart = torch.minimum((unit - other).norm(dim=1), (unit + other).norm(dim=1))
+    errors = {field: (getattr(found, field) - getattr(scene, field)).abs() for field in ("means", "log_scales")}
+    errors["rotations"] = 4 * torch.asin(apart / 2)
+    errors["opacities"] = (found.opacities - scene.opacities).abs()
+    errors["base"], errors["rest"] = (found.shs - scene.shs).abs()[:, 0], (found.shs - scene.shs).abs()[:, 1:]
+    expected = steps_of(name, scene)
+    for field, half in expected.items():
+        share = (errors[field] / half).max()
+        assert 0.5 < share <= ROUNDED, f"{field}: {share:.4f} of half a step"
+    for field in {"means", "log_scales"} - set(expected):  # float32, scales as they are
+        torch.testing.assert_close(getattr(found, field), getattr(scene, field), rtol=1.2e-7, atol=1.2e-7)
+
+
 def test_a_ply_comes_back_to_the_bit(tmp_path):
     """Parameters as they are: quaternions of any length, large logits, scales of 0."""
     scene = random_scene()
