@@ -1,6 +1,6 @@
 """The method `splatfacto-analytic`, within a stand-in for nerfstudio that does what ours relies on.
 
-nerfstudio itself is tried by benchmarks/nerfstudio.py, in an environment of its own.
+nerfstudio itself is tried by tests/with_nerfstudio.py, in an environment of its own.
 """
 
 import re
@@ -36,8 +36,8 @@ FILES = {
             def __init__(self, config):
                 self.config = config
             def get_outputs(self, camera):
-                mode = self.config.rasterize_mode
-                return rasterization(*camera[:5], viewmats=camera[5], Ks=camera[6], width=9, height=9, rasterize_mode=mode)
+                named = {"viewmats": camera[5], "Ks": camera[6], "width": 9, "height": 9}
+                return rasterization(*camera[:5], **named, rasterize_mode=self.config.rasterize_mode)
     """,
     "nerfstudio/configs/method_configs.py": """
         from importlib.metadata import EntryPoint
@@ -45,7 +45,8 @@ FILES = {
         from nerfstudio.models.splatfacto import SplatfactoModelConfig
         from nerfstudio.plugins.types import MethodSpecification
         model = SplatfactoModelConfig(refine_every=7)
-        config = SimpleNamespace(method_name="splatfacto", pipeline=SimpleNamespace(model=model), optimizers={"means": 1})
+        pipeline = SimpleNamespace(model=model)
+        config = SimpleNamespace(method_name="splatfacto", pipeline=pipeline, optimizers={"means": 1})
         method_configs = {"splatfacto": config}
         spec = EntryPoint("splatfacto-analytic", ENTRY_POINT, "nerfstudio.method_configs").load()
         assert isinstance(spec, MethodSpecification)
@@ -66,8 +67,8 @@ SCENE = """
     import dataclasses, threading
     import torch
     K = torch.tensor([[9.0, 0, 4.5], [0, 9, 4.5], [0, 0, 1]])[None]
-    scene = torch.tensor([[0.3, 0, 3.0]]), torch.eye(4)[:1], torch.tensor([[1.0, 0.1, 0.1]]), torch.ones(1), torch.ones(1, 3)
-    camera = *scene, torch.eye(4)[None], K
+    means, scales = torch.tensor([[[0.3, 0, 3.0]], [[1.0, 0.1, 0.1]]])
+    camera = means, torch.eye(4)[:1], scales, torch.ones(1), torch.ones(1, 3), torch.eye(4)[None], K
 """
 
 
@@ -162,7 +163,7 @@ def test_errors_come_before_a_model(run):
     first, second = printed.splitlines()
     assert "disc" in first and all(name in first for name in ar.FOOTPRINTS)
     assert second == (
-        "rasterize_mode must be left at 'classic' with splatfacto-analytic, whose option is footprint, got 'antialiased'"
+        "rasterize_mode must be 'classic' with splatfacto-analytic, whose option is footprint, got 'antialiased'"
     )
 
 

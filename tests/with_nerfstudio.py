@@ -8,6 +8,7 @@ not fall, no Gaussian is added, or gsplat's CUDA code is loaded. The perceptual 
 are on the network.
 """
 
+import os
 import sys
 from pathlib import Path
 from unittest import mock
@@ -42,7 +43,7 @@ class NoPerceptualMetric(torch.nn.Module):
 
 
 def import_torchvision():
-    """The wheels of PyPI do not load their operators beside a torch without CUDA, and stop at two that are not there."""
+    """Wheels of PyPI load no operators beside a torch without CUDA, and stop at two that are missing."""
     try:
         import torchvision  # noqa: F401
     except RuntimeError:
@@ -97,6 +98,7 @@ def main(capture, out, *options):
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
+    os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"  # nerfstudio 1.1.5 pickles NumPy's numbers
     import_torchvision()
     perceptual = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
     with cuda_on_cpu(), mock.patch(perceptual, NoPerceptualMetric):

@@ -45,7 +45,7 @@ class SplatfactoAnalyticModelConfig(splatfacto.SplatfactoModelConfig):
         default = splatfacto.SplatfactoModelConfig.rasterize_mode
         if self.rasterize_mode != default:
             raise ValueError(
-                f"rasterize_mode must be left at {default!r} with {NAME}, whose option is footprint, "
+                f"rasterize_mode must be {default!r} with {NAME}, whose option is footprint, "
                 f"got {self.rasterize_mode!r}"
             )
 
@@ -77,7 +77,7 @@ def _redirect() -> None:
     theirs: Callable | None = getattr(splatfacto, "rasterization", None)
     if theirs is None:
         raise ImportError(
-            f"{NAME} needs a nerfstudio whose splatfacto calls gsplat's rasterization, such as 1.1.5; this one's does not"
+            f"{NAME} needs a nerfstudio whose splatfacto calls gsplat's rasterization, such as 1.1.5; yours does not"
         )
     if hasattr(theirs, "_redirected"):
         return
