@@ -8,6 +8,7 @@ not fall, no Gaussian is added, or gsplat's CUDA code is loaded. The perceptual 
 are on the network.
 """
 
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -91,7 +92,7 @@ def main(capture, out, *options):
     print(f"{model.__module__}.{model.__name__}, {config.pipeline.model.footprint}, {checkpoint}: {metrics}")
     tenth = len(losses) // 10
     assert sum(losses[-tenth:]) < 0.7 * sum(losses[:tenth]), "the loss did not fall"
-    assert any(after > before for before, after in zip(counts, counts[1:])), "no Gaussian was added"
+    assert any(after > before for before, after in itertools.pairwise(counts)), "no Gaussian was added"
     assert "gsplat.cuda._backend" not in sys.modules, "gsplat's CUDA code was loaded"
 
 
