@@ -1,11 +1,13 @@
 """What a distribution says of itself, and what it holds beside the modules."""
 
+import configparser
 import email
 import os
 import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -53,6 +55,20 @@ def test_wheel_and_sdist_hold_what_modules_read_and_say_that_they_are_annotated(
     assert {"Makefile", "CMakeLists.txt", "CITATION.cff", "mkdocs.yml"} <= packed
     assert not [name for name in packed if name.endswith((".so", ".pyc"))]
     check_metadata(metadata)
+    (points,) = info.rglob("entry_points.txt")
+    found = {point.group: point for point in entry_points(points.read_text())}
+    method = found["nerfstudio.method_configs"]
+    assert method.name == "splatfacto-analytic" and (ROOT / f"{method.module.replace('.', '/')}.py").is_file()
+    assert set(found) == {"console_scripts", method.group}
+    assert "nerfstudio" not in str(metadata.get_all("Requires-Dist"))
+
+
+def entry_points(text):
+    """Those of a file entry_points.txt."""
+    parser = configparser.ConfigParser(delimiters="=")
+    parser.optionxform = str
+    parser.read_string(text)
+    return [EntryPoint(name, value, group) for group in parser.sections() for name, value in parser[group].items()]
 
 
 def check_metadata(metadata):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -99,12 +100,19 @@ def patch() -> None:
     import gsplat.rendering
     import gsplat.strategy.ops
 
-    version = tuple(int(number) for number in gsplat.__version__.split(".")[:2])
-    gsplat.rasterization = gsplat.rendering.rasterization = rasterization if version >= (1, 5) else _with_one_radius
+    gsplat.rasterization = gsplat.rendering.rasterization = rasterization_of_installed()
     gsplat.relocation.compute_relocation = gsplat.strategy.ops.compute_relocation = compute_relocation
     gsplat.quat_scale_to_covar_preci = gsplat.strategy.ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
     if hasattr(gsplat.strategy.ops, _TORCH_FLAG):
         setattr(gsplat.strategy.ops, _TORCH_FLAG, True)
+
+
+def rasterization_of_installed() -> Callable[..., Any]:
+    """`rasterization`, with the `meta` that the strategies of the installed gsplat read."""
+    import gsplat
+
+    version = tuple(int(number) for number in gsplat.__version__.split(".")[:2])
+    return rasterization if version >= (1, 5) else _with_one_radius
 
 
 @functools.wraps(rasterization)
