@@ -4,7 +4,7 @@
     python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
 
 The sources of the shaders and their constants are taken from the modules of the page, which node runs. What is around
-them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and blending. Footprints are
+them is drawn as webgl.js does it, with the same textures, geometry and blending. Footprints are
 those of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00. On Linux
 it comes from EGL and needs no window.
 
@@ -40,7 +40,7 @@ EXTRACT = """
 import { readFileSync } from 'fs';
 import { CONSTANTS } from './constants.js';
 import {
-  FULL_SCREEN, GL_KINDS, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
+  FULL_SCREEN, GL_KINDS, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
   texelsOfHarmonics,
 } from './webgl_shaders.js';
 
@@ -53,7 +53,7 @@ for (const { name, kind, samples, variance } of JSON.parse(readFileSync('given.j
 }
 console.log(JSON.stringify({
   near: CONSTANTS.kNear, frustum_clamp: CONSTANTS.kFrustumClamp, splats_per_row: SPLATS_PER_ROW,
-  splats_per_instance: SPLATS_PER_INSTANCE, texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
+  texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
   full_screen: FULL_SCREEN, projections, footprints,
 }));
 """
@@ -131,22 +131,20 @@ def create_context():
 
 
 class Renderer:
-    """What webgl_project.js and webgl.js do, for one scene."""
+    """What webgl.js does, for one scene."""
 
     def __init__(self, context, job: Job):
         self.context, self.job, self.shaders = context, job, job.page
         count, width = len(job.geometry), self.shaders["splats_per_row"]
         self.rows = -(-count // width)
         texels = self.shaders["texels_of_harmonics"][job.meta["sh_degree"]]
-        self.harmonics_per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
+        per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
         self.geometry = self.filled(3 * width, 4, "f4", job.geometry)
-        self.harmonics = self.filled(texels * self.harmonics_per_row, 4, "f2", job.harmonics)
+        self.harmonics = self.filled(texels * per_row, 4, "f2", job.harmonics)
         self.order = self.texture(width, self.rows, 1, "u4")
         self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
         self.splats_target = context.framebuffer(self.splats)
         self.visible = 0
-        corners = 4 * np.arange(self.shaders["splats_per_instance"])[:, None] + [0, 1, 2, 2, 1, 3]
-        self.corners = context.buffer(corners.astype(np.uint16).tobytes())
         self.programs, self.targets = {}, {}
         self.queries = [context.query(time=True) for _ in range(2)]
 
@@ -171,12 +169,12 @@ class Renderer:
             self.targets[key] = self.context.framebuffer([self.texture(camera.width, camera.height, 4, dtype)])
         return self.targets[key]
 
-    def program(self, vertex: str, fragment: str, indices=None):
+    def program(self, vertex: str, fragment: str):
         """A program and the empty vertex array that it draws."""
         key = (vertex, fragment)
         if key not in self.programs:
             program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
-            self.programs[key] = program, self.context.vertex_array(program, [], indices, index_element_size=2)
+            self.programs[key] = program, self.context.vertex_array(program, [])
         return self.programs[key]
 
     @staticmethod
@@ -210,8 +208,6 @@ class Renderer:
         view = np.array(camera.w2c).reshape(4, 4)
         clamp = self.shaders["frustum_clamp"] / 2
         values = {
-            "uCount": len(self.job.geometry),
-            "uHarmonicsPerRow": self.harmonics_per_row,
             "uView": [tuple(row) for row in view[:3]],
             "uEye": tuple(-view[:3, :3].T @ view[:3, 3]),
             "uPinhole": (camera.fx, camera.fy, camera.cx, camera.cy),
@@ -225,7 +221,7 @@ class Renderer:
     def draw(self, camera: Camera, name: str, dtype: str):
         """Draws the splats of the last projection; returns the framebuffer that holds the picture."""
         footprint, context = self.shaders["footprints"][name], self.context
-        program, vertices = self.program(footprint["vertex"], footprint["fragment"], self.corners)
+        program, vertices = self.program(footprint["vertex"], footprint["fragment"])
         target = self.target(camera, dtype)
         target.use()
         target.clear()
@@ -234,10 +230,9 @@ class Renderer:
         context.blend_func = context.ONE, context.ONE_MINUS_SRC_ALPHA
         names = ("uMean", "uWhitening", "uColor")
         textures = dict(zip(names, self.splats)) | {"uOrder": self.order}
-        self.set_uniforms(program, textures, uVisible=self.visible, uSize=(camera.width, camera.height))
-        instances = -(-self.visible // self.shaders["splats_per_instance"])
-        if instances > 0:
-            vertices.render(context.TRIANGLES, instances=instances)
+        self.set_uniforms(program, textures, uSize=(camera.width, camera.height))
+        if self.visible > 0:
+            vertices.render(context.TRIANGLES, vertices=6 * self.visible)
         return target
 
     def render(self, camera: Camera, name: str, dtype: str):

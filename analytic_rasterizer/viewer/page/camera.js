@@ -49,18 +49,23 @@ export function rotationOf(quaternion) {
 
 /// The pose a part of the way from one to another.
 export function between(from, to, part) {
-  const a = quaternionOf(from.axes);
-  let b = quaternionOf(to.axes);
-  let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
-  if (cosine < 0) [b, cosine] = [times(b, -1), -cosine];
-  const angle = Math.acos(Math.min(cosine, 1));
-  const weights = angle < 1e-4 ? [1 - part, part]
-    : [Math.sin((1 - part) * angle) / Math.sin(angle), Math.sin(part * angle) / Math.sin(angle)];
-  const mix = (u, v) => u + (v - u) * part;
+  const a = quaternionOf(from.axes), b = quaternionOf(to.axes);
+  const mix = (u, v) => add(times(u, 1 - part), times(v, part));
+  // Of the two quaternions of a rotation the nearer one.
+  const same = a.reduce((sum, value, i) => sum + value * b[i], 0) >= 0;
   return {
-    position: from.position.map((value, i) => mix(value, to.position[i])),
-    axes: rotationOf(add(times(a, weights[0]), times(b, weights[1]))),
-    distance: mix(from.distance, to.distance),
+    position: mix(from.position, to.position),
+    axes: rotationOf(mix(a, same ? b : times(b, -1))),
+    distance: mix([from.distance], [to.distance])[0],
+  };
+}
+
+/// Where a pinhole is, and the largest |x/z| and |y/z| that the Jacobian of its projection sees.
+export function eyeAndLimits({ width, height, fx, fy, w2c: v }) {
+  const clamp = CONSTANTS.kFrustumClamp / 2;
+  return {
+    eye: [0, 1, 2].map(c => -(v[c] * v[3] + v[4 + c] * v[7] + v[8 + c] * v[11])),
+    limits: [(clamp * width) / fx, (clamp * height) / fy],
   };
 }
 

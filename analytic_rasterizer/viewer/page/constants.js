@@ -50,6 +50,12 @@ export function cellsOf(samples) {
   return Array.from({ length: samples }, (_, s) => [centre(s % side), centre(Math.floor(s / side))]);
 }
 
+/// A float in the text of a shader, of WGSL or of GLSL.
+export const shaderNumber = value => {
+  if (Number.isInteger(value) && Math.abs(value) < 1e6) return `${value.toFixed(1)}f`;
+  return `${value.toPrecision(12)}f`;
+};
+
 /// In place of a footprint to compare with.
 export const PHOTOGRAPH = 'photograph';
 

@@ -1,6 +1,6 @@
 // Starts the viewer, or draws for a script: what the address says after the question mark, and the hooks for automation.
 
-import { announce, hideFailure, showFailure } from './interface.js';
+import { announce, showFailure } from './interface.js';
 import { loadMeta, loadScene } from './load.js';
 import { Viewer } from './viewer.js';
 
@@ -53,12 +53,11 @@ function automation(given) {
 
 async function main() {
   announce('Loading the scene');
-  const given = new URLSearchParams(location.search), bits = given.get('bits');
-  const viewer = new Viewer(await loadMeta(), given.get('renderer'), ['8', '16'].includes(bits) ? Number(bits) : 32);
+  const given = new URLSearchParams(location.search);
+  const viewer = new Viewer(await loadMeta(), given.get('renderer'));
   await viewer.open();  // what the device cannot hold is not loaded
   await viewer.load(await loadScene(viewer.meta, part => announce(`Loading the scene: ${Math.round(100 * part)}%`)));
   announce('');
-  hideFailure();
   window.analyticPixels = () => planes(viewer);
   window.analyticRender = (...view) => renderView(viewer, ...view);
   const asked = automation(given);

@@ -2,8 +2,9 @@
 // counts its tiles.
 
 import { support } from './bin.wgsl.js';
+import { shaderNumber } from './constants.js';
 import { KINDS } from './footprint.wgsl.js';
-import { FRAME, WORKGROUP, wgslNumber } from './frame.wgsl.js';
+import { FRAME, WORKGROUP } from './frame.wgsl.js';
 import { addHarmonics, sceneBytes } from './sh.js';
 
 // A Gaussian as the page gets it: `read` for its geometry, `number` for its harmonics.
@@ -29,7 +30,7 @@ fn gaussianOf(i: u32) -> Gaussian {
   var q: vec4f;
   q[last] = sqrt(max(1.0 - dot(v, v), 0.0));
   for (var k = 0u; k < 3u; k++) { q[(last + 1u + k) & 3u] = v[k]; }
-  return Gaussian(mean, c.y, vec3f(b, c.x) * ${wgslNumber(largest)}, q / length(q));
+  return Gaussian(mean, c.y, vec3f(b, c.x) * ${shaderNumber(largest)}, q / length(q));
 }`,
   type: 'u32',
   word: k => (k < 2 ? `unpack2x16float(harmonics[at + ${k}u])` : `unpack4x8snorm(harmonics[at + ${k}u]) * t1.y`),

@@ -25,3 +25,9 @@ export const harmonicNumbers = degree => 4 * Math.ceil((3 * (degree + 1) ** 2) /
 /// Bytes of geometry and of harmonics of a Gaussian. `compact` is how small scenes are (viewer/compact.py).
 export const sceneBytes = ({ sh_degree: degree, compact }) => (compact
   ? [24, 8 + 4 * Math.ceil((3 * ((degree + 1) ** 2 - 1)) / 4)] : [48, 2 * harmonicNumbers(degree)]);
+
+/// An Error where a device has no room for a scene. `working` is what it takes beside, of each Gaussian [bytes].
+export function noRoom(meta, working) {
+  const [geometry, harmonics] = sceneBytes(meta), bytes = meta.count * (geometry + harmonics + working);
+  return new Error(`The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its memory.`);
+}

@@ -15,9 +15,9 @@ const FLIGHT_SPEED = 0.7;       // distances of the target per second
 const LOSS_TIME = 500;          // ms in which a device that is lost says so
 
 export class Viewer {
-  /// `wish` and `bits` are those of openRenderer.
-  constructor(meta, wish, bits) {
-    Object.assign(this, { meta, wish, bits });
+  /// `wish` is that of openRenderer.
+  constructor(meta, wish) {
+    Object.assign(this, { meta, wish });
     this.surface = document.getElementById('surface');
     this.camera = new Camera(meta);
     this.state = {
@@ -39,7 +39,7 @@ export class Viewer {
 
   /// Opens a renderer for the scene, which is not here yet.
   async open() {
-    Object.assign(this, await openRenderer(this.meta, this.wish, this.bits));
+    Object.assign(this, await openRenderer(this.meta, this.wish));
     this.canvas = this.renderer.canvas;
   }
 

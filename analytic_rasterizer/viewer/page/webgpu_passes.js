@@ -10,6 +10,7 @@ import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './so
 
 const MOST_WORKGROUPS = 65535;  // along one direction
 const SPLAT_BYTES = 48;
+export const WORKING_BYTES = SPLAT_BYTES + 5 * 4;  // of a Gaussian beside the scene: splat, depths, order, tiles
 const FIRST_ROOM = 65536;       // pairs, until it is known how many there are
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
 const VISIBLE_SORT = 0, VISIBLE_EMIT = 16, PAIRS_SORT = 32;
