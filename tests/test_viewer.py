@@ -406,7 +406,7 @@ def test_the_command_shows_what_is_near_to_what_the_page_cannot_draw(files, caps
     assert capsys.readouterr().err == f"{expected}; --server shows it\n"
 
 
-def test_a_training_knows_the_photographs_of_its_views(tmp_path):
+def test_a_training_knows_the_photographs_of_its_views(tmp_path, monkeypatch):
     pytest.importorskip("scipy", reason="needs the train extra")
     image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
     data, out = tmp_path / "data", tmp_path / "out"
@@ -417,6 +417,7 @@ def test_a_training_knows_the_photographs_of_its_views(tmp_path):
     arguments = ["--iterations", "1", "--scales", "2,4", "--test-every", "0", "--device", "cpu"]
     assert cli.main(["train", str(data), "--out", str(out), *arguments]) == 0
 
+    monkeypatch.setattr("analytic_rasterizer.training.colmap.load_points", lambda _: pytest.fail("reads the points"))
     found = io.find_scene(out)
     views = [*found.load_views(), make_view("elsewhere")]
     photographs, said = find_photographs(found, views)

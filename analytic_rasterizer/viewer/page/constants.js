@@ -27,8 +27,7 @@ export const MINIMAX = [
   0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354, 0.006771038053309816,
 ];
 
-// Half of the nodes of pixels with several samples [px]; the other half is opposite. box_node of
-// csrc/core/footprint/gaussian.h.
+// Half of the nodes of a pixel [px], box_node of csrc/core/footprint/gaussian.h; the other half is opposite.
 export const HALF_NODES = {
   4: [[-0.12083, -0.36226], [0.36226, -0.12083]],
   16: [

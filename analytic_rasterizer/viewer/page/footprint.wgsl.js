@@ -11,8 +11,6 @@ export function sampling({ kind, samples }) {
 
 const point = ([x, y]) => `vec2f(${shaderNumber(x)}, ${shaderNumber(y)})`;
 
-// ------------------------------------------------------------------------------------------------- Gaussians
-
 const WHITENED = `
 fn whitened(w: vec3f, p: vec2f) -> vec2f { return vec2f(w.x * p.x, fma(w.y, p.x, w.z * p.y)); }
 `;
@@ -45,8 +43,6 @@ const GAUSSIAN = {
         let raw = exp2(log);${inner}
       }`,
 };
-
-// ------------------------------------------------------------------------------------------------- others
 
 const CUMULANTS = `
 fn cumulantAxis(t: f32, unit: f32, scale: f32) -> vec4f {  // c4, c6, linear, cap

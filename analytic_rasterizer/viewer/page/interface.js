@@ -139,8 +139,7 @@ export class Interface {
 
   connectKeys() {
     window.addEventListener('keydown', event => {
-      // Fields and the open dialog keep their keys; so do the browser's shortcuts. A dialog that has just been closed
-      // still has the focus until the next frame.
+      // Fields and the dialog keep their keys, also a dialog that has just been closed; so do the browser's shortcuts.
       const inField = event.target instanceof Element && event.target.closest('select, input, dialog[open]');
       if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
       if (this.press(event)) event.preventDefault();
@@ -275,8 +274,7 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows how fast frames are, and how large. `rate` is null where the camera rests. `stages` are milliseconds by name,
-  /// where the device tells.
+  /// Shows size and times of a frame. `rate` is null where the camera rests; `stages` are milliseconds by name.
   showFigures(width, height, milliseconds, rate, stages) {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';

@@ -5,13 +5,12 @@
 //   load(scene)                  throws an Error with a sentence where the device has no room
 //   draws(footprint)             whether it can draw an entry of `footprints` of the scene
 //   draw({camera, pictures, settled, cancelled})
-//                                draws pictures, each {name, footprint, span}; the columns from span[0] on up to span[1]
-//                                are needed [px]. `settled` ones are as exact as the device can. False if `cancelled`
-//                                has become true; there is no picture then
+//                                draws pictures, each {name, footprint, span}; columns from span[0] up to span[1] are
+//                                needed [px]. `settled` ones are as exact as the device can. False if `cancelled` has
+//                                become true; there is no picture then
 //   put(name, size, values)      a picture from elsewhere; transmittance is -1 where the other one is to be shown
 //   present({left, right, divider, difference, background})
-//                                shows the picture `left`, and from column `divider` of the canvas on `right`, or the
-//                                difference of the two
+//                                shows `left`, from column `divider` of the canvas on `right`, or their difference
 //   read(name)                   rejects where there is no picture
 //   isLost; `lost` resolves when the device is lost, `returned` when it can be had again
 //   dispose()
@@ -26,9 +25,8 @@ function freshCanvas() {
   return canvas;
 }
 
-/// The renderer for a scene, and why it is not WebGPU, or ''. `wish` is what the address says under `renderer`:
-/// 'webgpu' also takes a device that is only software, 'webgl' takes WebGL 2. Throws an Error with a sentence where
-/// neither can draw.
+/// The renderer for a scene, and why it is not WebGPU, or ''. Throws an Error with a sentence where there is none.
+/// `wish` is `renderer` of the address: 'webgpu' also takes a device that is only software, 'webgl' takes WebGL 2.
 export async function openRenderer(meta, wish) {
   let reason = 'the address asks for it.';
   if (wish !== 'webgl') {

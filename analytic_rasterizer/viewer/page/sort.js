@@ -18,8 +18,8 @@ onmessage = ({ data }) => {
   postMessage({ order }, [order.buffer]);
 };
 
-/// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Positive floats are ordered as
-/// their bits are. The sum is rounded at every step as the rasterizer rounds it, so that the order is the same.
+/// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Sums are rounded at every step, as
+/// the rasterizer rounds them. Positive floats are ordered as their bits are.
 function depths(row, near) {
   const fround = Math.fround, values = new Float32Array(keys.buffer);
   const [x, y, z, w] = row, limit = fround(near);

@@ -9,7 +9,7 @@ import {
   FULL_SCREEN, GL_KINDS, GL_PRESENT, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
   texelsOfHarmonics,
 } from './webgl_shaders.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
+import { createFramebuffer, createProgram, createTexture, fillTexture, runProgram } from './webgl_tools.js';
 
 const WORKING_BYTES_OF_GL = 3 * 16 + 4;  // of a Gaussian beside the scene: projected, order
 const POLL = 50;                         // ms
@@ -23,12 +23,9 @@ class Sorter {
     this.worker.postMessage({ geometry, count: meta.count });
   }
 
-  knows(w2c) {
-    return this.known === w2c.slice(8, 12).join();
-  }
+  knows(w2c) { return this.known === w2c.slice(8, 12).join(); }
 
-  /// Asks for the indices of the Gaussians in front of a camera, the farthest first, unless the worker is at work.
-  /// `take` is called with them.
+  /// Asks for the order that a camera sees, unless the worker is at work. `take` is called with it.
   ask(w2c, take) {
     this.busy ??= new Promise((resolve, reject) => {
       this.worker.onmessage = ({ data }) => resolve(data.order);
@@ -72,19 +69,21 @@ export class WebGLRenderer {
       resolve();
     }, { once: true }));
     this.returned = new Promise(resolve => canvas.addEventListener('webglcontextrestored', resolve, { once: true }));
+    this.floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
+    this.halves = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
     // Half floats are quick, but some devices cut them off at every blend where others round.
-    this.quickFormat = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
-    this.settledFormat = gl.getExtension('EXT_float_blend') ? [gl.RGBA32F, gl.RGBA, gl.FLOAT] : this.quickFormat;
+    this.settledFormat = gl.getExtension('EXT_float_blend') ? this.floats : this.halves;
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     this.programs = new Map();
     this.pictures = new Map();
   }
 
   async load({ meta, geometry, harmonics }) {
-    const { gl } = this, rows = Math.ceil(meta.count / SPLATS_PER_ROW);
-    const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT], halves = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
+    const { gl, floats, halves } = this, rows = Math.ceil(meta.count / SPLATS_PER_ROW);
     const words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
     this.orderFormat = [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT];
-    const texels = texelsOfHarmonics(meta.sh_degree), perRow = Math.floor(gl.getParameter(gl.MAX_TEXTURE_SIZE) / texels);
+    const texels = texelsOfHarmonics(meta.sh_degree);
+    const perRow = Math.floor(gl.getParameter(gl.MAX_TEXTURE_SIZE) / texels);
     this.geometry = createTexture(gl, 3 * SPLATS_PER_ROW, rows, floats);
     this.harmonics = createTexture(gl, texels * perRow, Math.ceil(meta.count / perRow), halves);
     this.order = createTexture(gl, SPLATS_PER_ROW, rows, this.orderFormat);
@@ -96,11 +95,9 @@ export class WebGLRenderer {
     this.sorter = new Sorter({ meta, geometry });
   }
 
-  draws({ kind, samples }) {
-    return samples === 1 && kind in GL_KINDS;
-  }
+  draws({ kind, samples }) { return samples === 1 && kind in GL_KINDS; }
 
-  /// A program and its uniforms, made once. `vertex` and `fragment` return sources.
+  /// A program, made once. `vertex` and `fragment` return sources.
   program(key, vertex, fragment) {
     if (!this.programs.has(key)) this.programs.set(key, createProgram(this.gl, vertex(), fragment()));
     return this.programs.get(key);
@@ -120,12 +117,9 @@ export class WebGLRenderer {
     return made;
   }
 
-  put(name, { width, height }, values) {
-    const { gl } = this, format = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
-    gl.deleteTexture(this.pictures.get(name)?.texture ?? null);
-    const texture = createTexture(gl, width, height, format);
-    fillTexture(gl, texture, width, format, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
-    this.pictures.set(name, { width, height, texture });
+  put(name, size, values) {
+    const { texture, width } = this.picture(name, size, this.floats);
+    fillTexture(this.gl, texture, width, this.floats, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
   }
 
   async draw({ camera, pictures, settled, cancelled = () => false }) {
@@ -140,7 +134,7 @@ export class WebGLRenderer {
     this.complain();
     for (const { name, footprint, span } of pictures) {
       this.project(camera, footprint);
-      this.blend(this.picture(name, camera, settled ? this.settledFormat : this.quickFormat), footprint, span);
+      this.blend(this.picture(name, camera, settled ? this.settledFormat : this.halves), footprint, span);
     }
     await this.finished();
     this.complain();
@@ -158,42 +152,27 @@ export class WebGLRenderer {
   }
 
   /// Projects all Gaussians for a footprint, replacing the splats of the last call.
-  project(camera, footprint) {
-    const { gl } = this, { eye, limits } = eyeAndLimits(camera);
-    const { program, uniforms } = this.program(
-      `project ${footprint.kind}`, () => FULL_SCREEN, () => projectShader(footprint.kind, this.degree));
-    gl.useProgram(program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);
-    gl.viewport(0, 0, SPLATS_PER_ROW, this.rows);
-    gl.disable(gl.BLEND);
-    bindTextures(gl, uniforms, { uGeometry: this.geometry, uHarmonics: this.harmonics });
-    gl.uniform4fv(uniforms.uView, camera.w2c.slice(0, 12));
-    gl.uniform3f(uniforms.uEye, ...eye);
-    gl.uniform4f(uniforms.uPinhole, camera.fx, camera.fy, camera.cx, camera.cy);
-    gl.uniform2f(uniforms.uLimit, ...limits);
-    gl.uniform1f(uniforms.uVariance, footprint.variance);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  project(camera, { kind, variance }) {
+    const { eye, limits } = eyeAndLimits(camera), { fx, fy, cx, cy, w2c } = camera;
+    const program = this.program(`project ${kind}`, () => FULL_SCREEN, () => projectShader(kind, this.degree));
+    runProgram(this.gl, program, {
+      framebuffer: this.projected, width: SPLATS_PER_ROW, height: this.rows,
+      textures: { uGeometry: this.geometry, uHarmonics: this.harmonics },
+      uniforms: {
+        uView: w2c.slice(0, 12), uEye: eye, uPinhole: [fx, fy, cx, cy], uLimit: limits, uVariance: [variance],
+      },
+    });
   }
 
   /// Blends the splats of the last projection into a picture, back to front.
-  blend({ framebuffer, width, height }, { kind }, span = [0, width]) {
-    const { gl } = this;
-    const { program, uniforms } = this.program(
-      `blend ${kind}`, () => drawVertexShader(kind), () => drawFragmentShader(kind));
-    gl.viewport(0, 0, width, height);
-    gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(span[0], 0, Math.max(span[1] - span[0], 0), height);
-    gl.useProgram(program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  blend(picture, { kind }, columns) {
+    const program = this.program(`blend ${kind}`, () => drawVertexShader(kind), () => drawFragmentShader(kind));
     const [uMean, uWhitening, uColor] = this.splats;
-    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: this.order });
-    gl.uniform2f(uniforms.uSize, width, height);
-    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.visible);
-    gl.disable(gl.SCISSOR_TEST);
+    runProgram(this.gl, program, {
+      ...picture, columns, blends: true, vertices: 6 * this.visible,
+      textures: { uMean, uWhitening, uColor, uOrder: this.order },
+      uniforms: { uSize: [picture.width, picture.height] },
+    });
   }
 
   /// Resolves when the device has drawn everything, or is lost.
@@ -207,20 +186,14 @@ export class WebGLRenderer {
   }
 
   present({ left, right = null, divider = 0, difference = false, background }) {
-    const gl = this.gl, { width, height } = this.canvas;
-    const a = this.pictures.get(left), b = this.pictures.get(right ?? left);
-    const { program, uniforms } = this.program('present', () => FULL_SCREEN, () => GL_PRESENT);
-    gl.useProgram(program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    gl.disable(gl.BLEND);
-    bindTextures(gl, uniforms, { uLeft: a.texture, uRight: b.texture });
-    gl.uniform2f(uniforms.uCanvas, width, height);
-    gl.uniform2f(uniforms.uSize, a.width, a.height);
-    gl.uniform3f(uniforms.uBackground, ...background);
-    gl.uniform1f(uniforms.uDivider, right === null ? width : divider);
-    gl.uniform1i(uniforms.uDifference, difference ? 1 : 0);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    const { width, height } = this.canvas, a = this.pictures.get(left), b = this.pictures.get(right ?? left);
+    runProgram(this.gl, this.program('present', () => FULL_SCREEN, () => GL_PRESENT), {
+      framebuffer: null, width, height, textures: { uLeft: a.texture, uRight: b.texture },
+      uniforms: {
+        uCanvas: [width, height], uSize: [a.width, a.height], uBackground: background,
+        uDivider: [right === null ? width : divider], uDifference: [difference ? 1 : 0],
+      },
+    });
   }
 
   async read(name) {
@@ -234,7 +207,5 @@ export class WebGLRenderer {
     return values.map((value, at) => (at % 4 === 3 ? 1 - value : value));
   }
 
-  dispose() {
-    this.sorter?.worker.terminate();
-  }
+  dispose() { this.sorter?.worker.terminate(); }
 }

@@ -1,8 +1,6 @@
-// GLSL of the passes: project, draw, present. The formulas are those of csrc/core, in the same form.
-//
-// Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
-// wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
-// GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
+// GLSL of the passes project, blend and present, after csrc/core. Everything is highp: 16 bits are too few for offsets
+// and exponents. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. The forms stay positive
+// however a compiler rounds them.
 
 import { CONSTANTS, MINIMAX, shaderNumber } from './constants.js';
 import { heatMap } from './present.wgsl.js';
@@ -213,9 +211,7 @@ uniform vec3 uBackground;
 uniform float uDivider;  // canvas px; right of it is uRight
 uniform bool uDifference;
 out vec4 color;
-vec3 over(vec4 c) {
-  return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0);
-}
+vec3 over(vec4 c) { return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0); }
 vec3 heat(float difference) {
   vec3 color;
   ${heatMap('vec3')}

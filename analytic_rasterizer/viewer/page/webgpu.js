@@ -71,9 +71,7 @@ export class WebGPURenderer {
     return await this.device.popErrorScope() === null;
   }
 
-  draws({ kind }) {
-    return kind in KINDS;
-  }
+  draws({ kind }) { return kind in KINDS; }
 
   draw(request) {
     const drawn = this.turn.then(() => this.drawNow(request));
@@ -145,7 +143,7 @@ export class WebGPURenderer {
       }
       this.pairs = wanted;
       if (passes.queries) this.noteStages(new BigUint64Array(numbers, 16), bands === 1 ? STAGES : STAGES.slice(0, -1));
-      if (bands === 1) this.measure(footprint, performance.now() - start, wanted);
+      if (bands === 1) this.rate = (performance.now() - start) / (Math.max(wanted, 1) * footprint.samples);
       return bands === 1 || await this.blendInBands(blended, footprint, top, bottom, bands, cancelled);
     }
   }
@@ -172,10 +170,6 @@ export class WebGPURenderer {
     }
   }
 
-  measure(footprint, milliseconds, pairs) {
-    this.rate = milliseconds / (Math.max(pairs, 1) * footprint.samples);
-  }
-
   async blendInBands(blended, footprint, top, bottom, bands, cancelled) {
     const height = Math.ceil((bottom - top) / bands), start = performance.now();
     for (let row = top; row < bottom; row += height) {
@@ -186,7 +180,7 @@ export class WebGPURenderer {
       await this.device.queue.onSubmittedWorkDone();
     }
     const took = performance.now() - start;
-    this.measure(footprint, took, this.pairs);
+    this.rate = took / (Math.max(this.pairs, 1) * footprint.samples);
     if (this.passes.queries) this.stages.blend = (this.stages.blend ?? 0) + took;
     return true;
   }
@@ -224,7 +218,5 @@ export class WebGPURenderer {
     return values;
   }
 
-  dispose() {
-    this.device.destroy();
-  }
+  dispose() { this.device.destroy(); }
 }
