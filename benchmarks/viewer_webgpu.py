@@ -37,7 +37,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from page_job import Job, add_scene, check_scene, difference, read_job, resized, run_node, table, to_bytes
+from page_job import Camera, Job, add_scene, check_scene, difference, read_job, resized, run_node, table, to_bytes
 
 TIMED = ["box:samples=1", "moment:samples=4", "analytic"]
 PAIRS = 26_000_000  # of splats and tiles, that there is room for: bindings of 128 MiB, which every device has
@@ -106,7 +106,11 @@ def record(job: Job, footprints: list[str]) -> dict:
 
 def what_is_drawn(job: Job) -> list:
     """What a plan is made for, beside footprints."""
-    cameras = [[size, [vars(camera) for camera in of_size]] for size, of_size in job.cameras.items()]
+
+    def numbers(camera: Camera) -> list[float]:  # machines may differ in the last digits
+        return [round(x, 6) for x in (camera.fx, camera.fy, camera.cx, camera.cy, *camera.w2c)]
+
+    cameras = [[size, *map(numbers, of_size)] for size, of_size in job.cameras.items()]
     return [job.meta["count"], job.meta["sh_degree"], cameras]
 
 
@@ -237,7 +241,9 @@ class Player:
         result = {"clock": 1e3 * (time.perf_counter() - start) / times}
         *_, room, wanted = numbers[:4]
         if wanted > room:
-            sys.exit(f"A picture has {wanted} pairs of splat and tile, more than the plan has room for, {room}.")
+            sys.exit(
+                f"A picture has {wanted} pairs of splat and tile, and PAIRS of this program gives room for {room}."
+            )
         result["pairs"] = int(wanted)
         if self.has_stamps:
             stamps = numbers[4:].view("<u8").astype(np.float64) * self.tick
