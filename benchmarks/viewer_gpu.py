@@ -40,7 +40,7 @@ EXTRACT = """
 import { readFileSync } from 'fs';
 import { CONSTANTS } from './constants.js';
 import {
-  FULL_SCREEN, GL_KINDS, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
+  FULL_SCREEN, GL_KINDS, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
   texelsOfHarmonics,
 } from './webgl_shaders.js';
 
@@ -53,7 +53,7 @@ for (const { name, kind, samples, variance } of JSON.parse(readFileSync('given.j
 }
 console.log(JSON.stringify({
   near: CONSTANTS.kNear, frustum_clamp: CONSTANTS.kFrustumClamp, splats_per_row: SPLATS_PER_ROW,
-  texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
+  splats_per_instance: SPLATS_PER_INSTANCE, texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
   full_screen: FULL_SCREEN, projections, footprints,
 }));
 """
@@ -145,6 +145,8 @@ class Renderer:
         self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
         self.splats_target = context.framebuffer(self.splats)
         self.visible = 0
+        corners = 4 * np.arange(self.shaders["splats_per_instance"])[:, None] + [0, 1, 2, 2, 1, 3]
+        self.corners = context.buffer(corners.astype(np.uint16).tobytes())
         self.programs, self.targets = {}, {}
         self.queries = [context.query(time=True) for _ in range(2)]
 
@@ -169,12 +171,12 @@ class Renderer:
             self.targets[key] = self.context.framebuffer([self.texture(camera.width, camera.height, 4, dtype)])
         return self.targets[key]
 
-    def program(self, vertex: str, fragment: str):
+    def program(self, vertex: str, fragment: str, indices=None):
         """A program and the empty vertex array that it draws."""
         key = (vertex, fragment)
         if key not in self.programs:
             program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
-            self.programs[key] = program, self.context.vertex_array(program, [])
+            self.programs[key] = program, self.context.vertex_array(program, [], indices, index_element_size=2)
         return self.programs[key]
 
     @staticmethod
@@ -221,7 +223,7 @@ class Renderer:
     def draw(self, camera: Camera, name: str, dtype: str):
         """Draws the splats of the last projection; returns the framebuffer that holds the picture."""
         footprint, context = self.shaders["footprints"][name], self.context
-        program, vertices = self.program(footprint["vertex"], footprint["fragment"])
+        program, vertices = self.program(footprint["vertex"], footprint["fragment"], self.corners)
         target = self.target(camera, dtype)
         target.use()
         target.clear()
@@ -230,9 +232,10 @@ class Renderer:
         context.blend_func = context.ONE, context.ONE_MINUS_SRC_ALPHA
         names = ("uMean", "uWhitening", "uColor")
         textures = dict(zip(names, self.splats)) | {"uOrder": self.order}
-        self.set_uniforms(program, textures, uSize=(camera.width, camera.height))
-        if self.visible > 0:
-            vertices.render(context.TRIANGLES, vertices=6 * self.visible)
+        self.set_uniforms(program, textures, uVisible=self.visible, uSize=(camera.width, camera.height))
+        instances = -(-self.visible // self.shaders["splats_per_instance"])
+        if instances > 0:
+            vertices.render(context.TRIANGLES, instances=instances)
         return target
 
     def render(self, camera: Camera, name: str, dtype: str):

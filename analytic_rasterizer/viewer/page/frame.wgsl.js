@@ -1,5 +1,4 @@
 // WGSL that every pass begins with: numbers of the rasterizer, and what is known of a frame. The passes of a picture:
-//
 //   project -> sort by depth -> bin: (tile, splat) pairs in that order -> sort by tile -> blend -> present
 
 import { eyeAndLimits } from './camera.js';

@@ -176,9 +176,7 @@ export class Viewer {
   }
 
   /// An entry of the footprints. Throws for an unknown name.
-  footprint(name) {
-    return parseFootprint(name, this.meta.footprints);
-  }
+  footprint(name) { return parseFootprint(name, this.meta.footprints); }
 
   /// What is drawn for this name: a quicker footprint while the camera moves, and where the renderer cannot draw it.
   drawn(name, moving = false) {

@@ -6,8 +6,8 @@ import { CONSTANTS } from './constants.js';
 import { startSorter } from './load.js';
 import { noRoom } from './sh.js';
 import {
-  FULL_SCREEN, GL_KINDS, GL_PRESENT, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
-  texelsOfHarmonics,
+  FULL_SCREEN, GL_KINDS, GL_PRESENT, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader,
+  projectShader, texelsOfHarmonics,
 } from './webgl_shaders.js';
 import { createFramebuffer, createProgram, createTexture, fillTexture, runProgram } from './webgl_tools.js';
 
@@ -74,6 +74,10 @@ export class WebGLRenderer {
     // Half floats are quick, but some devices cut them off at every blend where others round.
     this.settledFormat = gl.getExtension('EXT_float_blend') ? this.floats : this.halves;
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    const corner = (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6];
+    const corners = Uint16Array.from({ length: 6 * SPLATS_PER_INSTANCE }, corner);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.programs = new Map();
     this.pictures = new Map();
   }
@@ -169,9 +173,10 @@ export class WebGLRenderer {
     const program = this.program(`blend ${kind}`, () => drawVertexShader(kind), () => drawFragmentShader(kind));
     const [uMean, uWhitening, uColor] = this.splats;
     runProgram(this.gl, program, {
-      ...picture, columns, blends: true, vertices: 6 * this.visible,
+      ...picture, columns, blends: true,
+      quads: { indices: 6 * SPLATS_PER_INSTANCE, instances: Math.ceil(this.visible / SPLATS_PER_INSTANCE) },
       textures: { uMean, uWhitening, uColor, uOrder: this.order },
-      uniforms: { uSize: [picture.width, picture.height] },
+      uniforms: { uSize: [picture.width, picture.height], uVisible: [this.visible] },
     });
   }
 

@@ -1,11 +1,12 @@
-// GLSL of the passes project, blend and present, after csrc/core. Everything is highp: 16 bits are too few for offsets
-// and exponents. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. The forms stay positive
-// however a compiler rounds them.
+// GLSL of the passes project, blend and present, after csrc/core. Everything is highp: 16 bits are too few. Offsets are
+// floor(gl_FragCoord) - mean, not interpolated, which is exact. Forms stay positive however a compiler rounds them.
 
 import { CONSTANTS, MINIMAX, shaderNumber } from './constants.js';
 import { heatMap } from './present.wgsl.js';
 import { addHarmonics, harmonicNumbers } from './sh.js';
 
+// Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
+export const SPLATS_PER_INSTANCE = 4096;
 // Splats in a row of the textures that have one texel, or three, per splat.
 export const SPLATS_PER_ROW = 1024;
 
@@ -160,17 +161,18 @@ flat ${direction} highp vec2 fMean, fR;
 flat ${direction} highp float fPeak;
 `;
 
-/// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses: two triangles, 6 vertices. `window` is
-/// wider than its Gaussian by the variance of the pixel.
+/// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses, of `window` wider by the pixel's variance.
 export function drawVertexShader(kind) {
   return `${HEAD}
 uniform usampler2D uMean, uWhitening, uColor, uOrder;
+uniform float uVisible;
 uniform vec2 uSize;
 ${varyings('out')}
 ivec2 texelOf(int k) { return ivec2(k % ${SPLATS_PER_ROW}, k / ${SPLATS_PER_ROW}); }
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: not drawn
-  int k = gl_VertexID / 6, v = gl_VertexID % 6;
+  int k = gl_InstanceID * ${SPLATS_PER_INSTANCE} + gl_VertexID / 4;
+  if (k >= int(uVisible)) return;
   ivec2 texel = texelOf(int(texelFetch(uOrder, texelOf(k), 0).x));
   vec4 m = uintBitsToFloat(texelFetch(uMean, texel, 0));
   if (!(m.z > 0.0)) return;
@@ -181,7 +183,7 @@ void main() {
   fColor = uintBitsToFloat(texelFetch(uColor, texel, 0)).xyz;
   vec2 shrink = ${kind === 'window' ? 'inversesqrt(1.0 + kPixelVariance * fR * fR)' : 'vec2(1.0)'};
   vec4 E = vec4(fW.xy * shrink.x, fW.zw * shrink.y);
-  vec2 corner = vec2(v == 1 || v > 3 ? 1.0 : -1.0, v == 2 || v == 3 || v == 5 ? 1.0 : -1.0);
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   const float margin = 0.25;  // px on all sides, because vertices may snap to 1/16 px
   vec2 s = corner * (m.z + margin * vec2(abs(E.x) + abs(E.y), abs(E.z) + abs(E.w)));
   vec2 offset = vec2(E.w * s.x - E.y * s.y, E.x * s.y - E.z * s.x) / (E.x * E.w - E.y * E.z);

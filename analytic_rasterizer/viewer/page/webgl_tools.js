@@ -52,10 +52,10 @@ export function createFramebuffer(gl, textures) {
   return framebuffer;
 }
 
-/// Draws triangles with a program of createProgram, into `columns` of a framebuffer; null is the canvas. `textures` and
-/// `uniforms` have the names of the shaders; a uniform is a list of floats, or a flat one of vectors of four.
+/// Draws a triangle or quads into `columns` of a framebuffer, or of the canvas for null. `textures` and `uniforms` are by
+/// their names in the shaders; a uniform is a list of floats, or a flat one of vectors of four.
 export function runProgram(gl, { program, places }, target) {
-  const { framebuffer, width, height, columns = [0, width], blends = false, textures, uniforms, vertices = 3 } = target;
+  const { framebuffer, width, height, columns = [0, width], blends = false, textures, uniforms, quads } = target;
   const placeOf = name => places[name] ??= gl.getUniformLocation(program, name);
   gl.useProgram(program);
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
@@ -72,5 +72,6 @@ export function runProgram(gl, { program, places }, target) {
   for (const [name, values] of Object.entries(uniforms)) {
     gl[`uniform${Math.min(values.length, 4)}fv`](placeOf(name), values);
   }
-  gl.drawArrays(gl.TRIANGLES, 0, vertices);
+  if (quads) gl.drawElementsInstanced(gl.TRIANGLES, quads.indices, gl.UNSIGNED_SHORT, 0, quads.instances);
+  else gl.drawArrays(gl.TRIANGLES, 0, 3);
 }

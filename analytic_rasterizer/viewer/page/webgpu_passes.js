@@ -111,9 +111,7 @@ export class Passes {
   }
 
   /// Pairs that a binding can have.
-  get mostPairs() {
-    return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4);
-  }
+  get mostPairs() { return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4); }
 
   /// Makes room for so many pairs, or as many as a binding can have, and forgets those that there were.
   reserve(room) {
