@@ -4,7 +4,7 @@
     python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
 
 The sources of the shaders and their constants are taken from the modules of the page, which node runs. What is around
-them is drawn as webgl_project.js and webgl.js do it, with the same textures, geometry and blending. Footprints are
+them is drawn as webgl.js does it, with the same textures, geometry and blending. Footprints are
 those of one sample, which WebGL 2 draws. Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00. On Linux
 it comes from EGL and needs no window.
 
@@ -28,16 +28,14 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from page_job import Camera, Job, add_scene, check_scene, difference, read_job, run_node, table, to_bytes
 
-MODULES = ("constants.js", "sh.js", "webgl_shaders.js")
 EXTRACT = """
 import { readFileSync } from 'fs';
 import { CONSTANTS } from './constants.js';
@@ -48,7 +46,7 @@ import {
 
 const DEGREES = [0, 1, 2, 3];
 const footprints = {}, projections = {};
-for (const { name, kind, samples, variance } of JSON.parse(readFileSync('footprints.json', 'utf8'))) {
+for (const { name, kind, samples, variance } of JSON.parse(readFileSync('given.json', 'utf8'))) {
   if (samples > 1 || !(kind in GL_KINDS)) continue;
   footprints[name] = { kind, variance, vertex: drawVertexShader(kind), fragment: drawFragmentShader(kind) };
   projections[kind] = DEGREES.map(degree => projectShader(kind, degree));
@@ -69,21 +67,23 @@ def main() -> None:
     if args.write_shaders:
         Path(args.write_shaders).write_text(json.dumps(extract_shaders()))
         return
-    job = Job.load(args.scene) if is_prepared(args.scene) else prepare(args)
+    job = read_job(args)
+    if job.page is None:
+        shaders = json.loads(Path(args.shaders).read_text()) if args.shaders else extract_shaders()
+        job = replace(job, page=shaders)
+    names = args.footprints or list(job.page["footprints"])
     if args.prepare:
-        job.save(args.prepare)
+        job.save(args.prepare, names)
         return
     context = create_context()
     device = f"{context.info['GL_RENDERER']}, OpenGL {context.info['GL_VERSION']}"
-    print(f"{job.name}: {len(job.geometry)} Gaussians of SH degree {job.degree}, {len(job.cameras)} sizes, {device}")
+    print(f"{job}, {len(job.cameras)} sizes, {device}")
     renderer = Renderer(context, job)
-    names = args.footprints or list(job.shaders["footprints"])
     differences = compare(renderer, job, names)
     print(f"\n{format_differences(differences, job)}" if differences else "\nNot compared: no pictures of these views.")
     if args.pictures:
         save_pictures(renderer, job, names, Path(args.pictures))
-    results = {"device": device, "scene": job.name, "gaussians": len(job.geometry), "sh_degree": job.degree}
-    results |= {"differences": differences, "rows": []}
+    results = {"device": device, "scene": str(job), "differences": differences, "rows": []}
     for size in job.cameras:
         rows = measure(renderer, job, size, names, args.rounds, args.seconds)
         print(f"\n{format_rows(rows, size)}", flush=True)
@@ -94,148 +94,23 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    add_scene(parser)
     add = parser.add_argument
-    add("scene", nargs="?", help=".ply, compressed .ply, .spz, .npz of scene_files.py, or what --prepare wrote")
-    add("--views", help="file of views")
-    add("--limit-views", type=int, help="use only so many of them")
-    add("--sizes", default="512x384,1920x1080", help="of the pictures (default: %(default)s)")
-    add("--footprints", nargs="+", metavar="NAME", help="those of the page (default: all)")
-    add("--rounds", type=int, default=30, help="timed rounds after warming up (default: %(default)s)")
     add("--seconds", type=float, default=60.0, help="for the rounds of a size, at most (default: %(default)s)")
-    add("--json", help="also write everything measured to this file")
     add("--pictures", help="also write pictures of the first view and size to this folder, as PNG; needs pillow")
     add("--shaders", help="file that --write-shaders wrote, instead of node")
     add("--write-shaders", metavar="FILE", help="write the shaders of the page to this file, and end")
-    add("--prepare", metavar="FILE", help="write all that measuring needs to this .npz, and end")
     args = parser.parse_args()
     if not args.write_shaders:
-        if args.scene is None:
-            parser.error("a scene is needed")
-        if not is_prepared(args.scene) and args.views is None:
-            parser.error("--views is needed")
+        check_scene(parser, args)
     return args
-
-
-# --------------------------------------------------------------------------------------- preparing
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole of the page: lengths in pixels, `w2c` 16 numbers by rows."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    w2c: list[float]
-
-
-@dataclass(frozen=True)
-class Job:
-    """What is to be drawn, in the form that the page has it.
-
-    Attributes:
-        name: Of the scene.
-        degree: Of its spherical harmonics.
-        geometry, harmonics: float32 (P, 12) and float16 (P, numbers), as `viewer.PackedScene` describes them.
-        shaders: What `extract_shaders` returns.
-        cameras: By size, "WxH", one for each view.
-        expected: By footprint, the pictures of all views at the first size: uint8 (views, 3, height, width).
-    """
-
-    name: str
-    degree: int
-    geometry: np.ndarray
-    harmonics: np.ndarray
-    shaders: dict
-    cameras: dict[str, list[Camera]]
-    expected: dict[str, np.ndarray]
-
-    def save(self, path: str) -> None:
-        cameras = {size: [vars(camera) for camera in of_size] for size, of_size in self.cameras.items()}
-        meta = {"name": self.name, "degree": self.degree, "shaders": self.shaders, "cameras": cameras}
-        arrays = {"geometry": self.geometry, "harmonics": self.harmonics}
-        arrays |= {f"expected {name}": pictures for name, pictures in self.expected.items()}
-        with open(path, "wb") as file:
-            np.savez_compressed(file, job=np.array(json.dumps(meta)), **arrays)
-
-    @staticmethod
-    def load(path: str) -> Job:
-        with np.load(path) as file:
-            meta = json.loads(str(file["job"]))
-            meta["cameras"] = {size: [Camera(**c) for c in of_size] for size, of_size in meta["cameras"].items()}
-            prefix = "expected "
-            expected = {key.removeprefix(prefix): file[key] for key in file if key.startswith(prefix)}
-            return Job(**meta, geometry=file["geometry"], harmonics=file["harmonics"], expected=expected)
-
-
-def is_prepared(path: str) -> bool:
-    if Path(path).suffix != ".npz":
-        return False
-    with np.load(path) as file:
-        return "job" in file
 
 
 def extract_shaders() -> dict:
     """The sources and numbers of the page, by its own modules."""
-    from analytic_rasterizer.viewer import packing, pages
+    from analytic_rasterizer.viewer import packing
 
-    with tempfile.TemporaryDirectory() as folder:
-        for name in MODULES:
-            (Path(folder) / name).write_text(pages.page_file(name))
-        (Path(folder) / "package.json").write_text('{"type": "module"}')
-        (Path(folder) / "footprints.json").write_text(json.dumps(packing.PAGE_ENTRIES))
-        (Path(folder) / "extract.js").write_text(EXTRACT)
-        try:
-            done = subprocess.run(["node", "extract.js"], cwd=folder, capture_output=True, text=True, check=True)
-        except FileNotFoundError:
-            sys.exit("The shaders are read out of the page by node, which is not installed: see --write-shaders.")
-    return json.loads(done.stdout)
-
-
-def prepare(args: argparse.Namespace) -> Job:
-    """The job of a scene and views, with pictures of the CPU rasterizer."""
-    from common import parse_size
-    from scene_files import load_scene
-
-    from analytic_rasterizer import io, render_stages, viewer
-
-    shaders = json.loads(Path(args.shaders).read_text()) if args.shaders else extract_shaders()
-    scene, views = load_scene(args.scene), io.load_views(args.views)[: args.limit_views]
-    packed = viewer.pack_scene(scene, views, name=Path(args.scene).name)
-    count = len(scene.means)
-
-    def resized(view: io.View, size: str) -> io.View:
-        width, height = parse_size(size)
-        x, y = width / view.width, height / view.height
-        cx, cy = view.middle
-        return replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=x * cx, cy=y * cy)
-
-    def camera(view: io.View) -> Camera:
-        lens = {key: getattr(view, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        return Camera(**lens, w2c=view.w2c.flatten().tolist())
-
-    def picture(view: io.View, footprint: str) -> np.ndarray:
-        settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint)
-        return to_bytes(render_stages(settings, **scene.arguments()).color.numpy())
-
-    sizes = args.sizes.split(",")
-    names = args.footprints or list(shaders["footprints"])
-    return Job(
-        packed.meta["name"],
-        scene.sh_degree,
-        np.frombuffer(packed.geometry, "<f4").reshape(count, -1),
-        np.frombuffer(packed.harmonics, "<f2").reshape(count, -1),
-        shaders,
-        {size: [camera(resized(view, size)) for view in views] for size in sizes},
-        {name: np.stack([picture(resized(view, sizes[0]), name) for view in views]) for name in names},
-    )
-
-
-def to_bytes(picture: np.ndarray) -> np.ndarray:
-    return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
+    return run_node(EXTRACT, packing.PAGE_ENTRIES)
 
 
 # --------------------------------------------------------------------------------------- drawing
@@ -256,16 +131,16 @@ def create_context():
 
 
 class Renderer:
-    """What webgl_project.js and webgl.js do, for one scene."""
+    """What webgl.js does, for one scene."""
 
     def __init__(self, context, job: Job):
-        self.context, self.job, self.shaders = context, job, job.shaders
+        self.context, self.job, self.shaders = context, job, job.page
         count, width = len(job.geometry), self.shaders["splats_per_row"]
         self.rows = -(-count // width)
-        texels = self.shaders["texels_of_harmonics"][job.degree]
-        self.harmonics_per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
+        texels = self.shaders["texels_of_harmonics"][job.meta["sh_degree"]]
+        per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
         self.geometry = self.filled(3 * width, 4, "f4", job.geometry)
-        self.harmonics = self.filled(texels * self.harmonics_per_row, 4, "f2", job.harmonics)
+        self.harmonics = self.filled(texels * per_row, 4, "f2", job.harmonics)
         self.order = self.texture(width, self.rows, 1, "u4")
         self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
         self.splats_target = context.framebuffer(self.splats)
@@ -327,7 +202,7 @@ class Renderer:
 
     def project(self, camera: Camera, name: str) -> None:
         footprint, context = self.shaders["footprints"][name], self.context
-        source = self.shaders["projections"][footprint["kind"]][self.job.degree]
+        source = self.shaders["projections"][footprint["kind"]][self.job.meta["sh_degree"]]
         program, vertices = self.program(self.shaders["full_screen"], source)
         self.splats_target.use()
         context.viewport = (0, 0, self.shaders["splats_per_row"], self.rows)
@@ -335,8 +210,6 @@ class Renderer:
         view = np.array(camera.w2c).reshape(4, 4)
         clamp = self.shaders["frustum_clamp"] / 2
         values = {
-            "uCount": len(self.job.geometry),
-            "uHarmonicsPerRow": self.harmonics_per_row,
             "uView": [tuple(row) for row in view[:3]],
             "uEye": tuple(-view[:3, :3].T @ view[:3, 3]),
             "uPinhole": (camera.fx, camera.fy, camera.cx, camera.cy),
@@ -381,22 +254,17 @@ class Renderer:
 
 
 def compare(renderer: Renderer, job: Job, names: list[str]) -> dict[str, dict]:
-    """By footprint and what is blended: the largest difference from the expected pictures [levels of 255], its 99.99th
-    percentile, and the part of the values that differ."""
+    """By footprint and what is blended, the difference from the expected pictures."""
     cameras = next(iter(job.cameras.values()))
     differences = {}
     for name in names:
-        if name not in job.expected:
+        expected = job.expected(name)
+        if expected is None:
             continue
         differences[name] = {}
         for dtype, bits in BITS.items():
             ours = np.stack([renderer.picture(camera, name, dtype) for camera in cameras])
-            levels = np.abs(ours.astype(np.int16) - job.expected[name])
-            differences[name][bits] = {
-                "largest": int(levels.max()),
-                "99.99%": float(np.quantile(levels, 0.9999)),
-                "differing": float((levels > 0).mean()),
-            }
+            differences[name][bits] = difference(ours, expected)
     return differences
 
 
@@ -478,13 +346,6 @@ def ratio_to_point(samples: dict[str, list], name: str, key: str) -> float:
 # --------------------------------------------------------------------------------------- tables
 
 
-def table(header: list[str], rows: list[list]) -> str:
-    cells = [header, *([str(cell) for cell in row] for row in rows)]
-    widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
-    lines = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths)) + " |" for row in cells]
-    return "\n".join([lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]])
-
-
 def format_differences(differences: dict[str, dict], job: Job) -> str:
     header = [f"{next(iter(job.cameras))}, levels of 255"]
     header += [f"{bits}: {column}" for bits in BITS.values() for column in ("largest", "99.99%", "differing")]
@@ -492,7 +353,7 @@ def format_differences(differences: dict[str, dict], job: Job) -> str:
     for name, of_name in differences.items():
         row = [name]
         for found in of_name.values():
-            row += [found["largest"], f"{found['99.99%']:.2f}", f"{100 * found['differing']:.3f}%"]
+            row += [found["largest"], f"{found['99.99%']:.2f}", f"{100 * found['off'] / found['values']:.3f}%"]
         rows.append(row)
     return table(header, rows)
 

@@ -703,10 +703,58 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
             assert len(row["ms"]) == 2 and all(len(view) == 2 for view in row["ms"])
 
     prepared = benchmark.Job.load(job)
-    swapped = prepared.expected | {"analytic": prepared.expected["point"]}
-    dataclasses.replace(prepared, expected=swapped).save(job)
+    dataclasses.replace(prepared, expected=lambda _: prepared.expected("point")).save(job, ["analytic"])
     run(job, *rounds, "--footprints", "analytic")
     assert json.loads(written.read_text())["differences"]["analytic"]["32-bit floats"]["largest"] > 1
+
+
+def test_viewer_webgpu(small_scene, monkeypatch, capsys):
+    """The page's passes in wgpu draw what the rasterizer does, also from a plan and a prepared file; other pictures are
+    noticed."""
+    pytest.importorskip("wgpu", reason="needs wgpu")
+    if shutil.which("node") is None:
+        pytest.skip("needs node, which records what the page does")
+    benchmark = importlib.import_module("viewer_webgpu")
+    monkeypatch.setattr(benchmark, "PAIRS", 1000)
+    monkeypatch.setattr(benchmark, "WARM_UP", 0.0)
+    try:
+        benchmark.open_device({"buffers": [[16, 0]]})
+    except SystemExit as error:
+        pytest.skip(str(error))
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["viewer_webgpu.py", *map(str, arguments)])
+        benchmark.main()
+        return capsys.readouterr().out
+
+    plan, job, written = (small_scene / name for name in ("plan.json", "job.npz", "out.json"))
+    scene = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
+    names = ["analytic", "moment:samples=4", "mip:variance=0.3"]
+    options = ["--footprints", *names, "--timed", "moment:samples=4", "--rounds", "2", "--repeat", "2"]
+    run(*scene, *options, "--write-plan", plan)
+    run(*scene, *options, "--plan", plan, "--prepare", job)
+    for given in ([*scene, "--plan", plan], [job]):
+        out = run(*given, *options, "--json", written)
+        results = json.loads(written.read_text())
+        assert list(results["differences"]) == names
+        for name, found in results["differences"].items():
+            assert f"  {name}: largest difference" in out
+            assert found["largest"] <= 1 and found["changed"] == 0 and found["values"] == 2 * 3 * 40 * 30
+        assert [(row["size"], row["footprint"]) for row in results["rows"]] == [
+            ("40x30", "moment:samples=4"),
+            ("20x15", "moment:samples=4"),
+        ]
+        for row in results["rows"]:
+            assert row["clock"] > 0 and row["pairs"] > 0 and len(row["views"]) == 2
+
+    prepared = benchmark.Job.load(job)
+    dataclasses.replace(prepared, expected=lambda _: prepared.expected("mip:variance=0.3")).save(job, names)
+    run(job, *options, "--json", written)
+    assert json.loads(written.read_text())["differences"]["analytic"]["largest"] > 1
+    with pytest.raises(SystemExit, match="another number of Gaussians, other views or other sizes"):
+        run(*scene[:-1], "40x30", *options, "--plan", plan)
+    with pytest.raises(SystemExit, match="has no point at 40x30"):
+        run(*scene, *options, "--plan", plan, "--footprints", "point")
 
 
 def test_every_kernel(device, monkeypatch, capsys):

@@ -237,6 +237,8 @@ def test_nerfstudio_names_its_points(tmp_path):
         write_nerfstudio(tmp_path, lambda content, wrong=wrong: content.update(ply_file_path=wrong))
         with pytest.raises(io.SceneError, match=f"ply_file_path must name a file beside it, got {wrong!r}"):
             training.load_capture(tmp_path)
+    without = captures.load_photographs(tmp_path)  # which reads no points
+    assert (len(without.train), len(without.test), without.points) == (7, 2, None)
 
 
 @pytest.mark.parametrize(

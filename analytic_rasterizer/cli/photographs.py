@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 from ..io import FoundScene, View, to_image
-from ..training.captures import Photograph, load_capture
+from ..training.captures import Photograph, load_photographs
 from ..training.options import TrainingOptions
 from ..training.pictures import load_pictures
 from ..training.start import capture_arguments
@@ -24,9 +24,9 @@ def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Ca
         return {}, []
     try:
         source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # which the training has said
-            capture = load_capture(source["scene"], **capture_arguments(source))
+        arguments = capture_arguments(source)
+        arguments.pop("offset", None)  # views are known by their names
+        capture = load_photographs(source["scene"], **arguments)
     except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
         return {}, [f"no photographs: {error}"]
     items = {item.view.name: item for item in (*capture.train, *capture.test)}

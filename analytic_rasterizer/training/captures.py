@@ -89,10 +89,7 @@ def load_capture(
             f"{folder / MASKS}, or mask_path names them",
             stacklevel=2,
         )
-    if masks == "none":
-        capture = _each(capture, mask=None)
-    if alpha == "mask":
-        capture = _each(capture, alpha_is_mask=True)
+    capture = _with_masks(capture, masks, alpha)
     photographs = [*capture.train, *capture.test]
     _warn_of_near(folder, photographs, capture.points)
     distorted = [item for item in photographs if item.view.lens is not None]
@@ -109,7 +106,7 @@ def load_capture(
     if distorted and lens == "undistort":
         _check_windows(folder, distorted)
         notes.append(_about_lost_area(distorted, len(photographs)))
-        capture = capture._replace(train=_undistorted(capture.train), test=_undistorted(capture.test))
+        capture = _undistorted(capture)
     elif distorted:
         notes.append(_about_lenses(distorted, len(photographs)))
     if offset is None:
@@ -121,11 +118,37 @@ def load_capture(
     return _relative_to(capture, offset)._replace(notes=tuple(notes))
 
 
-def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None, missing: str) -> Capture:
+def load_photographs(
+    folder,
+    images: str = IMAGES,
+    test_every: int = TEST_PERIOD,
+    *,
+    cameras: str | None = None,
+    lens: str = "keep",
+    missing: str = "refuse",
+    masks: str = "auto",
+    alpha: str = "background",
+) -> Capture:
+    """What `load_capture` reads, but without points, and in world coordinates. Nothing is warned of or left out.
+
+    Arguments, and what is raised, as there.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise io.SceneError(f"{folder}: no such folder")
+    capture = read_cameras(folder, images, test_every, cameras, missing, with_points=False)
+    check_capture(folder, capture)
+    capture = _with_masks(capture, masks, alpha)
+    return _undistorted(capture) if lens == "undistort" else capture
+
+
+def read_cameras(
+    folder: Path, images: str, test_every: int, cameras: str | None, missing: str, with_points: bool = True
+) -> Capture:
     """The capture in world coordinates, as far as files of cameras and points say. Arguments as `load_capture`."""
 
     def read(place: Path) -> Capture:
-        capture = read_layout(folder, place, images, test_every)._replace(source=place)
+        capture = read_layout(folder, place, images, test_every, with_points)._replace(source=place)
         return _without_missing(capture) if missing == "skip" else capture
 
     if cameras is not None:
@@ -269,6 +292,13 @@ def _warn_of_near(
         )
 
 
+def _with_masks(capture: Capture, masks: str, alpha: str) -> Capture:
+    """The capture with what these arguments of `load_capture` say of its photographs."""
+    if masks == "none":
+        capture = _each(capture, mask=None)
+    return _each(capture, alpha_is_mask=True) if alpha == "mask" else capture
+
+
 def _each(capture: Capture, **changes) -> Capture:
     """The capture with other fields of every photograph."""
     train, test = ([item._replace(**changes) for item in items] for items in (capture.train, capture.test))
@@ -284,8 +314,12 @@ def _check_windows(folder: Path, distorted: list[Photograph]) -> None:
             raise io.SceneError(f"{folder}: {item.files[1]}: {error}; leave out --lens undistort") from None
 
 
-def _undistorted(items: list[Photograph]) -> list[Photograph]:
-    return [item._replace(undistort=item.view.lens is not None) for item in items]
+def _undistorted(capture: Capture) -> Capture:
+    train, test = (
+        [item._replace(undistort=item.view.lens is not None) for item in items]
+        for items in (capture.train, capture.test)
+    )
+    return capture._replace(train=train, test=test)
 
 
 def lens_models(items: list[Photograph]) -> str:

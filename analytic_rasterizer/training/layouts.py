@@ -72,10 +72,10 @@ class Capture(NamedTuple):
     source: Path | None = None
 
 
-def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capture:
+def read_layout(folder: Path, place: Path, images: str, test_every: int, with_points: bool = True) -> Capture:
     """The capture whose cameras are in this file or folder."""
     if place.is_dir():
-        return reconstruction(folder, place, images, test_every)
+        return reconstruction(folder, place, images, test_every, with_points)
     if not place.is_file():
         raise io.SceneError(f"{place}: no such file or folder of cameras")
     if place.name == "metadata.json":
@@ -84,11 +84,11 @@ def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capt
     if place.name == "transforms_train.json":
         test_file = place.with_name("transforms_test.json")
         test = transforms(test_file)[0] if test_file.exists() else []
-        return Capture(transforms(place)[0], test, WHITE, initial_points(folder))
-    return nerfstudio(place, test_every)
+        return Capture(transforms(place)[0], test, WHITE, initial_points(folder) if with_points else None)
+    return nerfstudio(place, test_every, with_points)
 
 
-def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> Capture:
+def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, with_points: bool = True) -> Capture:
     """The capture of a COLMAP reconstruction whose pictures are in a folder `images` of `folder`.
 
     Raises io.SceneError for what `colmap.load_views` refuses.
@@ -105,11 +105,13 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
     files = PictureFiles(folder / images)
     masks = PictureFiles(folder / MASKS)
     items = [Photograph(item.view, {1: files.find(item.name)}, mask=_mask_of(masks, item.name)) for item in registered]
-    points = colmap.load_points(sparse)
+    points = colmap.load_points(sparse) if with_points else None
+    if points is None and with_points:
+        points = initial_points(sparse)
     return Capture(
         *_split(folder, items, test_every),
         BLACK,
-        initial_points(sparse) if points is None else points,
+        points,
         starts_in_view=True,
         ignored_masks=0 if any(item.mask for item in items) else _count_masks(folder, folder / images),
     )
@@ -139,7 +141,7 @@ def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
     return found, data
 
 
-def nerfstudio(path: Path, test_every: int) -> Capture:
+def nerfstudio(path: Path, test_every: int, with_points: bool = True) -> Capture:
     """The capture of a transforms.json: its pictures by name, and the points of the file that it names.
 
     Which pictures to train with and to test with is what its lists train_filenames, val_filenames and test_filenames
@@ -151,13 +153,7 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
     and for points that are not there.
     """
     items, data = transforms(path)
-    points_file = data.get("ply_file_path")
-    if points_file is None:
-        points = initial_points(path.parent)
-    elif isinstance(points_file, str) and (path.parent / points_file.replace("\\", "/")).is_file():
-        points = load_points(path.parent / points_file.replace("\\", "/"))
-    else:
-        raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
+    points = _points_beside(path, data.get("ply_file_path")) if with_points else None
     items.sort(key=lambda item: str(item.files[1]))
     ignored = 0 if any(item.mask for item in items) else _count_masks(path.parent)
     pictures, lists = PictureFiles(path.parent), {}
@@ -177,6 +173,15 @@ def nerfstudio(path: Path, test_every: int) -> Capture:
     else:
         splits = _split(path.parent, items, test_every)
     return Capture(*splits, BLACK, points, starts_in_view=True, ignored_masks=ignored)
+
+
+def _points_beside(path: Path, name: Any) -> tuple[Tensor, Tensor] | None:
+    """The points of a transforms.json that names their file, or None as that."""
+    if name is None:
+        return initial_points(path.parent)
+    if isinstance(name, str) and (file := path.parent / name.replace("\\", "/")).is_file():
+        return load_points(file)
+    raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {name!r}")
 
 
 def has_splits(path: Path) -> bool:

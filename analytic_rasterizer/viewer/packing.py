@@ -25,8 +25,8 @@ from ..footprints import (
 from ..gaussians import Gaussians
 from .compact import LARGEST_HALF, compact_geometry, compact_harmonics
 
-MOVING = "moving"
-"""kPage of footprints whose samples move."""
+NEEDS_WEBGPU = ("moving", "cumulants")
+"""kPage of footprints that WebGL 2 does not draw."""
 
 
 def _page_entry(name: str) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def _page_entry(name: str) -> dict[str, Any]:
         "samples": samples,
         "variance": of_header["variance"],
         "option": of_header["option"] if of_header["value"] is None else None,
-        "instead": FASTEST if samples > 1 or of_header["page"] == MOVING else None,
+        "instead": FASTEST if samples > 1 or of_header["page"] in NEEDS_WEBGPU else None,
     }
 
 

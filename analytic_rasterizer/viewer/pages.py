@@ -7,6 +7,7 @@ from importlib import resources
 MODULES = (
     "constants.js",
     "sh.js",
+    "camera.js",
     "frame.wgsl.js",
     "footprint.wgsl.js",
     "sort.wgsl.js",
@@ -19,10 +20,8 @@ MODULES = (
     "load.js",
     "webgl_tools.js",
     "webgl_shaders.js",
-    "webgl_project.js",
     "webgl.js",
     "renderers.js",
-    "camera.js",
     "interface.js",
     "photograph.js",
     "address.js",

@@ -1,5 +1,4 @@
-// WGSL of the lists of splats of every tile, after csrc/core/bin.h: which tiles a splat can touch, and the passes that
-// write a pair (tile, splat) for each.
+// WGSL of the lists of tiles, after csrc/core/bin.h: passes that write pairs of a splat and a tile that it touches.
 
 import { FRAME, TILE, WORKGROUP } from './frame.wgsl.js';
 import { KINDS } from './footprint.wgsl.js';

@@ -1,8 +1,9 @@
 // WGSL of blending, after csrc/core/blend.h: a workgroup draws a tile, front to back. Each sample of a pixel keeps its
 // own transmittance, negative once it is closed, and its place where samples move.
 
+import { shaderNumber } from './constants.js';
 import { KINDS, sampleOf, sampling } from './footprint.wgsl.js';
-import { FRAME, TILE, wgslNumber } from './frame.wgsl.js';
+import { FRAME, TILE } from './frame.wgsl.js';
 
 const BATCH = TILE * TILE;  // splats in workgroup memory at once: one for each thread
 
@@ -60,7 +61,7 @@ fn main(@builtin(local_invocation_id) local: vec3u, @builtin(local_invocation_in
     }
   }
   if (!inside) { return; }
-  let through = (${nodes.map((_, s) => `abs(T${s})`).join(' + ')}) / ${wgslNumber(nodes.length)};
-  picture[at.y * frame.size.x + at.x] = vec4f(sum / ${wgslNumber(nodes.length)}, through);
+  let through = (${nodes.map((_, s) => `abs(T${s})`).join(' + ')}) / ${shaderNumber(nodes.length)};
+  picture[at.y * frame.size.x + at.x] = vec4f(sum / ${shaderNumber(nodes.length)}, through);
 }`;
 }

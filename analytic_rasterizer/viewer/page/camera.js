@@ -12,8 +12,7 @@ export const cross = (a, b) => [
 export const unit = a => times(a, 1 / Math.hypot(...a));
 const minus = (a, b) => a.map((value, i) => value - b[i]);
 
-// Turning about a point and moving to it end before it is behind the near plane, and before the scene is this many
-// times its radius away.
+// Distances of the point that the camera turns about; the farthest in radii of the scene.
 const NEAREST = 1.5 * CONSTANTS.kNear, FARTHEST = 30;
 // The angle between looking direction and up stays this far from 0 and pi when turning about a point.
 const STEEPEST = 0.05;
@@ -49,18 +48,23 @@ export function rotationOf(quaternion) {
 
 /// The pose a part of the way from one to another.
 export function between(from, to, part) {
-  const a = quaternionOf(from.axes);
-  let b = quaternionOf(to.axes);
-  let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
-  if (cosine < 0) [b, cosine] = [times(b, -1), -cosine];
-  const angle = Math.acos(Math.min(cosine, 1));
-  const weights = angle < 1e-4 ? [1 - part, part]
-    : [Math.sin((1 - part) * angle) / Math.sin(angle), Math.sin(part * angle) / Math.sin(angle)];
-  const mix = (u, v) => u + (v - u) * part;
+  const a = quaternionOf(from.axes), b = quaternionOf(to.axes);
+  const mix = (u, v) => add(times(u, 1 - part), times(v, part));
+  // Of the two quaternions of a rotation the nearer one.
+  const same = a.reduce((sum, value, i) => sum + value * b[i], 0) >= 0;
   return {
-    position: from.position.map((value, i) => mix(value, to.position[i])),
-    axes: rotationOf(add(times(a, weights[0]), times(b, weights[1]))),
-    distance: mix(from.distance, to.distance),
+    position: mix(from.position, to.position),
+    axes: rotationOf(mix(a, same ? b : times(b, -1))),
+    distance: mix([from.distance], [to.distance])[0],
+  };
+}
+
+/// Where a pinhole is, and the largest |x/z| and |y/z| that the Jacobian of its projection sees.
+export function eyeAndLimits({ width, height, fx, fy, w2c: v }) {
+  const clamp = CONSTANTS.kFrustumClamp / 2;
+  return {
+    eye: [0, 1, 2].map(c => -(v[c] * v[3] + v[4 + c] * v[7] + v[8 + c] * v[11])),
+    limits: [(clamp * width) / fx, (clamp * height) / fy],
   };
 }
 
@@ -73,15 +77,8 @@ export class Camera {
   }
 
   /// The pose: position, axes (rows right, down, forward) and distance of the point that the camera turns about.
-  get pose() {
-    return { position: this.position, axes: this.axes, distance: this.distance };
-  }
-
-  set pose({ position, axes, distance }) {
-    this.position = position;
-    this.axes = axes;
-    this.distance = distance;
-  }
+  get pose() { return { position: this.position, axes: this.axes, distance: this.distance }; }
+  set pose(pose) { Object.assign(this, pose); }
 
   /// Pose of view k. The camera turns about the point in front of it that is nearest to the middle of the scene.
   poseOfView(k) {
@@ -98,9 +95,7 @@ export class Camera {
     this.pose = this.poseOfView(k);
   }
 
-  get target() {
-    return add(this.position, times(this.axes[2], this.distance));
-  }
+  get target() { return add(this.position, times(this.axes[2], this.distance)); }
 
   /// The matrix from world to camera, 16 numbers by rows. `exactly` at view k, it is that of the file.
   matrix(exactly) {
@@ -185,20 +180,17 @@ export class Camera {
   }
 }
 
-/// Depth at which half of the light of a pixel is gone, or null where it meets nothing. Splats count as round, which is
-/// enough to choose a point to turn about.
+/// Depth at which half of the light of a pixel is gone, or null where it meets nothing. Splats count as round.
 export function depthAt(geometry, pinhole, x, y) {
-  const m = pinhole.w2c, hits = [];
+  const m = pinhole.w2c, hits = [], g = geometry;
+  const row = (k, at) => m[k] * g[at] + m[k + 1] * g[at + 1] + m[k + 2] * g[at + 2] + m[k + 3];
   for (let at = 0; at < geometry.length; at += 12) {
-    const [px, py, pz] = [geometry[at], geometry[at + 1], geometry[at + 2]];
-    const z = m[8] * px + m[9] * py + m[10] * pz + m[11];
-    if (!(z > 0.2)) continue;
-    const dx = (pinhole.fx * (m[0] * px + m[1] * py + m[2] * pz + m[3])) / z + pinhole.cx - x;
-    const dy = (pinhole.fy * (m[4] * px + m[5] * py + m[6] * pz + m[7])) / z + pinhole.cy - y;
-    const size = Math.cbrt(geometry[at + 4] * geometry[at + 5] * geometry[at + 6]);
+    const z = row(8, at);
+    if (!(z > CONSTANTS.kNear)) continue;
+    const dx = (pinhole.fx * row(0, at)) / z + pinhole.cx - x, dy = (pinhole.fy * row(4, at)) / z + pinhole.cy - y;
+    const size = Math.cbrt(g[at + 4] * g[at + 5] * g[at + 6]);
     const sigma = 1 + (pinhole.fx * size) / z, squared = (dx * dx + dy * dy) / (sigma * sigma);
-    if (squared > 9) continue;
-    hits.push([z, geometry[at + 3] * Math.exp(-0.5 * squared)]);
+    if (squared < 9) hits.push([z, g[at + 3] * Math.exp(-0.5 * squared)]);
   }
   hits.sort((a, b) => a[0] - b[0]);
   let transmittance = 1;
@@ -206,5 +198,5 @@ export function depthAt(geometry, pinhole, x, y) {
     transmittance *= 1 - alpha;
     if (transmittance < 0.5) return z;
   }
-  return hits.length > 0 ? hits[0][0] : null;
+  return hits[0]?.[0] ?? null;
 }

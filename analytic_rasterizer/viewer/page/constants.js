@@ -27,8 +27,7 @@ export const MINIMAX = [
   0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354, 0.006771038053309816,
 ];
 
-// Half of the nodes of pixels with several samples [px]; the other half is opposite. box_node of
-// csrc/core/footprint/gaussian.h.
+// Half of the nodes of a pixel [px], box_node of csrc/core/footprint/gaussian.h; the other half is opposite.
 export const HALF_NODES = {
   4: [[-0.12083, -0.36226], [0.36226, -0.12083]],
   16: [
@@ -49,6 +48,12 @@ export function cellsOf(samples) {
   const side = Math.sqrt(samples), centre = k => (2 * k + 1 - side) / (2 * side);
   return Array.from({ length: samples }, (_, s) => [centre(s % side), centre(Math.floor(s / side))]);
 }
+
+/// A float in the text of a shader, of WGSL or of GLSL.
+export const shaderNumber = value => {
+  if (Number.isInteger(value) && Math.abs(value) < 1e6) return `${value.toFixed(1)}f`;
+  return `${value.toPrecision(12)}f`;
+};
 
 /// In place of a footprint to compare with.
 export const PHOTOGRAPH = 'photograph';

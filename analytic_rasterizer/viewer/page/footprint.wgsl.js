@@ -1,7 +1,6 @@
 // WGSL of the footprints, from the headers of csrc/core/footprint. A header names its formula, a key of KINDS, by kPage.
 
-import { MINIMAX, cellsOf, nodesOf } from './constants.js';
-import { wgslNumber } from './frame.wgsl.js';
+import { MINIMAX, cellsOf, nodesOf, shaderNumber } from './constants.js';
 
 /// What passes need to know of an entry of `footprints` of the scene (viewer/packing.py). `reach` is the largest
 /// |coordinate| of a node [px].
@@ -10,9 +9,7 @@ export function sampling({ kind, samples }) {
   return { nodes, moves, side: Math.sqrt(samples), reach: moves ? 0.5 : Math.max(...nodes.flat().map(Math.abs)) };
 }
 
-const point = ([x, y]) => `vec2f(${wgslNumber(x)}, ${wgslNumber(y)})`;
-
-// ------------------------------------------------------------------------------------------------- Gaussians
+const point = ([x, y]) => `vec2f(${shaderNumber(x)}, ${shaderNumber(y)})`;
 
 const WHITENED = `
 fn whitened(w: vec3f, p: vec2f) -> vec2f { return vec2f(w.x * p.x, fma(w.y, p.x, w.z * p.y)); }
@@ -47,8 +44,6 @@ const GAUSSIAN = {
       }`,
 };
 
-// ------------------------------------------------------------------------------------------------- others
-
 const CUMULANTS = `
 fn cumulantAxis(t: f32, unit: f32, scale: f32) -> vec4f {  // c4, c6, linear, cap
   let x = t * scale * kPixelVariance;
@@ -72,7 +67,7 @@ struct Axis { half: f32, constant: f32, square: f32 }
 fn axisAt(r: f32) -> Axis { return Axis(0.5 * r, r * (kLogistic1 + 0.25 * kLogistic3 * r * r), 3.0 * kLogistic3 * r); }
 fn logistic2(z: f32) -> f32 { return z * fma(kLogistic3 * kLog2e * z, z, kLogistic1 * kLog2e); }
 fn oneMinusExp(x: f32, e: f32) -> f32 {  // 1 - exp(-x), of which e = exp(-x)
-  let series = ${MINIMAX.map(wgslNumber).reduceRight((sum, c) => `fma(${sum}, x, ${c})`)};
+  let series = ${MINIMAX.map(shaderNumber).reduceRight((sum, c) => `fma(${sum}, x, ${c})`)};
   return select(1.0 - e, x * series, x < 0.5);
 }
 struct Window { numerator: f32, denominator: f32 }
@@ -155,7 +150,7 @@ export function sampleOf(footprint, s) {
   const { nodes, moves, side } = sampling(footprint), node = nodes[s], half = 0.5 / side;
   if (!moves) return { place: footprint.samples === 1 ? null : point(node), start: '', move: '' };
   // step() of moment.h; node and cell of the sample.
-  const perStep = wgslNumber(12 * footprint.samples);
+  const perStep = shaderNumber(12 * footprint.samples);
   const lo = point(node.map(x => x - half)), hi = point(node.map(x => x + half));
   return {
     place: `P${s}`,

@@ -1,22 +1,16 @@
-// WGSL that every pass begins with: numbers of the rasterizer, and what is known of a frame. Plain strings: there is no
-// build step. The passes of a picture, each in a file that is named after the header of csrc/core that it follows:
-//
+// WGSL that every pass begins with: numbers of the rasterizer, and what is known of a frame. The passes of a picture:
 //   project -> sort by depth -> bin: (tile, splat) pairs in that order -> sort by tile -> blend -> present
 
-import { CONSTANTS } from './constants.js';
+import { eyeAndLimits } from './camera.js';
+import { CONSTANTS, shaderNumber } from './constants.js';
 
 export const TILE = 8;          // edge of a tile [px]
 export const WORKGROUP = 256;   // threads
 
-export const wgslNumber = value => {
-  if (Number.isInteger(value) && Math.abs(value) < 1e6) return `${value.toFixed(1)}f`;
-  return `${value.toPrecision(12)}f`;
-};
-
 export const FRAME_BYTES = 144;
 
 export const FRAME = `
-${Object.entries(CONSTANTS).map(([name, value]) => `const ${name} = ${wgslNumber(value)};`).join('\n')}
+${Object.entries(CONSTANTS).map(([name, value]) => `const ${name} = ${shaderNumber(value)};`).join('\n')}
 struct Frame {
   viewX: vec4f, viewY: vec4f, viewZ: vec4f,  // rows of world to camera
   eye: vec4f,
@@ -37,11 +31,9 @@ struct Splat { a: vec4f, b: vec4f, c: vec4f }
 
 /// A camera and a footprint as the struct above. `region` is [first column, first row, end column, end row] in tiles.
 export function frameData(camera, variance, reach, region, count, room) {
-  const { width, height, fx, fy, cx, cy, w2c: v } = camera, clamp = CONSTANTS.kFrustumClamp / 2;
+  const { width, height, fx, fy, cx, cy, w2c } = camera, { eye, limits } = eyeAndLimits(camera);
   const data = new ArrayBuffer(FRAME_BYTES), floats = new Float32Array(data), words = new Uint32Array(data);
-  floats.set(v.slice(0, 12), 0);
-  floats.set([0, 1, 2].map(c => -(v[c] * v[3] + v[4 + c] * v[7] + v[8 + c] * v[11])), 12);
-  floats.set([fx, fy, cx, cy, (clamp * width) / fx, (clamp * height) / fy, variance, reach], 16);
+  floats.set([...w2c.slice(0, 12), ...eye, 0, fx, fy, cx, cy, ...limits, variance, reach]);
   words.set([...region, width, height, Math.ceil(width / TILE), Math.ceil(height / TILE), count, room, 0, 0], 24);
   return data;
 }

@@ -20,15 +20,9 @@ export const rgbOf = hex => [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 
 
 /// Shows one sentence in place of the picture.
 export function showFailure(sentence) {
-  const paragraph = document.createElement('p');
-  paragraph.textContent = sentence;
-  element('message').replaceChildren(paragraph);
+  element('failure').textContent = sentence;
   element('message').hidden = false;
   announce('');
-}
-
-export function hideFailure() {
-  element('message').hidden = true;
 }
 
 let announcementEnds;
@@ -80,8 +74,7 @@ export class Interface {
     element('compare').replaceChildren(new Option('nothing', ''), ...photographs, ...options());
     const lacks = all.some(footprint => !renderer.draws(footprint));
     element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
-      `${lacks ? ' Footprints in grey need WebGPU.' : ''}` +
-      `${renderer.bits === 8 ? ' It has 8 bits per channel: colours are off by up to 6 of 255 levels.' : ''}`;
+      `${lacks ? ' Footprints in grey need WebGPU.' : ''}`;
   }
 
   connectControls() {
@@ -146,8 +139,7 @@ export class Interface {
 
   connectKeys() {
     window.addEventListener('keydown', event => {
-      // Fields and the open dialog keep their keys; so do the browser's shortcuts. A dialog that has just been closed
-      // still has the focus until the next frame.
+      // Fields and the dialog keep their keys, also a dialog that has just been closed; so do the browser's shortcuts.
       const inField = event.target instanceof Element && event.target.closest('select, input, dialog[open]');
       if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
       if (this.press(event)) event.preventDefault();
@@ -270,7 +262,9 @@ export class Interface {
     const { view, lens } = this.viewer.camera, has = this.viewer.meta.photographs.includes(view);
     const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
     const notes = [...(isPhotograph && !besidePhotograph ? [missing] : []), given.join('; ')];
-    this.showNote([...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ').trim());
+    const note = [...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ').trim();
+    element('note').textContent = note;
+    element('note').hidden = note === '';
   }
 
   /// A footprint, and what is drawn for it where that is another one.
@@ -280,17 +274,11 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows how fast frames are, and how large. `rate` is null where the camera rests. `stages` are milliseconds by name,
-  /// where the device tells.
+  /// Shows size and times of a frame. `rate` is null where the camera rests; `stages` are milliseconds by name.
   showFigures(width, height, milliseconds, rate, stages) {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
     element('figures').textContent = `${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
-  }
-
-  showNote(text) {
-    element('note').textContent = text;
-    element('note').hidden = text === '';
   }
 }

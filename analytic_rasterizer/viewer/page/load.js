@@ -12,21 +12,12 @@ export async function loadMeta() {
 
 /// {meta, geometry, harmonics}; `progress` is called with the part that has been read, from 0 to 1.
 export async function loadScene(meta, progress) {
-  if (isExported()) {
-    const geometry = await unpack('geometry');
-    progress(0.5);
-    const harmonics = await unpack('harmonics');
-    return sceneOf(meta, geometry, harmonics);
-  }
+  if (isExported()) return sceneOf(meta, await unpack('geometry'), await unpack('harmonics'));
   const responses = await Promise.all([get('geometry.bin'), get('harmonics.bin')]);
-  const sizes = responses.map(response => Number(response.headers.get('Content-Length')));
-  const done = [0, 0], total = sizes[0] + sizes[1];
-  const buffers = await Promise.all(responses.map((response, i) =>
-    readAll(response, sizes[i], bytes => {
-      done[i] = bytes;
-      progress((done[0] + done[1]) / total);
-    })));
-  return sceneOf(meta, ...buffers);
+  const total = sizeOf(responses[0]) + sizeOf(responses[1]);
+  let done = 0;
+  const note = bytes => progress((done += bytes) / total);
+  return sceneOf(meta, ...await Promise.all(responses.map(response => readAll(response, note))));
 }
 
 /// For compact scenes also `packed`, as it came; `geometry` then has no quaternions.
@@ -58,17 +49,20 @@ export async function get(name, sentence = 'The scene cannot be loaded.') {
   return response;
 }
 
-async function readAll(response, size, progress) {
-  const bytes = new Uint8Array(size), reader = response.body.getReader();
+const sizeOf = response => Number(response.headers.get('Content-Length'));
+
+/// `note` is called with the bytes of every part.
+async function readAll(response, note) {
+  const bytes = new Uint8Array(sizeOf(response)), reader = response.body.getReader();
   let length = 0;
   for (;;) {
     const { done, value } = await reader.read();
     if (done) break;
     bytes.set(value, length);
     length += value.length;
-    progress(length);
+    note(value.length);
   }
-  if (length !== size) throw new Error('The connection ended before the scene was complete.');
+  if (length !== bytes.length) throw new Error('The connection ended before the scene was complete.');
   return bytes.buffer;
 }
 

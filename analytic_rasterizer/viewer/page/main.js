@@ -1,6 +1,6 @@
 // Starts the viewer, or draws for a script: what the address says after the question mark, and the hooks for automation.
 
-import { announce, hideFailure, showFailure } from './interface.js';
+import { announce, showFailure } from './interface.js';
 import { loadMeta, loadScene } from './load.js';
 import { Viewer } from './viewer.js';
 
@@ -15,12 +15,10 @@ async function renderView(viewer, k, footprint, width, height) {
   const pinhole = camera.pinhole(width ?? views[k].width, height ?? views[k].height, true, true);
   for (;;) {
     await viewer.recovery;
-    const { renderer, canvas } = viewer;
+    const { renderer } = viewer, { canvas } = renderer;
     if (!renderer.draws(parsed)) throw new Error(`${renderer.name} cannot draw '${footprint}': ${viewer.reason}`);
     canvas.width = pinhole.width;
     canvas.height = pinhole.height;
-    canvas.style.width = `${pinhole.width}px`;
-    canvas.style.height = `${pinhole.height}px`;
     try {
       await renderer.draw({ camera: pinhole, pictures: [{ name: 'asked', footprint: parsed }], settled: true });
       renderer.present({ left: 'asked', background: meta.background });
@@ -45,20 +43,16 @@ function automation(given) {
   if (!['view', 'size'].some(key => given.has(key))) return null;
   const size = given.get('size')?.match(/^(\d{1,5})x(\d{1,5})$/);
   if (given.has('size') && !(size && size[1] > 0 && size[2] > 0)) throw new Error('size must be like 640x480.');
-  return {
-    view: Number(given.get('view') ?? 0), footprint: given.get('footprint'),
-    width: size ? Number(size[1]) : undefined, height: size ? Number(size[2]) : undefined,
-  };
+  return { view: Number(given.get('view') ?? 0), footprint: given.get('footprint'), size: size?.slice(1).map(Number) };
 }
 
 async function main() {
   announce('Loading the scene');
-  const given = new URLSearchParams(location.search), bits = given.get('bits');
-  const viewer = new Viewer(await loadMeta(), given.get('renderer'), ['8', '16'].includes(bits) ? Number(bits) : 32);
+  const given = new URLSearchParams(location.search);
+  const viewer = new Viewer(await loadMeta(), given.get('renderer'));
   await viewer.open();  // what the device cannot hold is not loaded
   await viewer.load(await loadScene(viewer.meta, part => announce(`Loading the scene: ${Math.round(100 * part)}%`)));
   announce('');
-  hideFailure();
   window.analyticPixels = () => planes(viewer);
   window.analyticRender = (...view) => renderView(viewer, ...view);
   const asked = automation(given);
@@ -68,7 +62,7 @@ async function main() {
   }
   document.body.classList.add('bare');
   const footprint = asked.footprint ?? viewer.drawn(viewer.meta.footprint).name;
-  await renderView(viewer, asked.view, footprint, asked.width, asked.height);
+  await renderView(viewer, asked.view, footprint, ...(asked.size ?? []));
   window.analyticReady = true;
 }
 

@@ -9,8 +9,7 @@ async function loadPhotograph(k) {
   return createImageBitmap(await response.blob(), { colorSpaceConversion: 'none', premultiplyAlpha: 'none' });
 }
 
-/// A photograph as a picture of its view: four numbers a pixel, the last of them 0, or -1 where the view does not
-/// reach. `pinhole` is that of the picture, `lens` the view.
+/// A photograph as values for `put`. `pinhole` is that of the picture, `lens` the view.
 function asPicture(bitmap, pinhole, lens) {
   const { width, height } = pinhole, canvas = new OffscreenCanvas(width, height);
   const context = canvas.getContext('2d', { willReadFrequently: true });
@@ -30,8 +29,7 @@ export class Photographs {
     this.placed = {};
   }
 
-  /// Brings the photograph of the camera's view into the renderer, as the picture PHOTOGRAPH of this pinhole. False
-  /// while it is not here.
+  /// Puts the photograph of the camera's view into the renderer, as the picture PHOTOGRAPH. False until it is here.
   place(renderer, pinhole, { view, lens }) {
     if (this.asked.view !== view) {
       const asked = this.asked = { view, bitmap: null };

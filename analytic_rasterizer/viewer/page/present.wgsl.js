@@ -10,8 +10,15 @@ export const screenData = ({ canvas, size, divider, difference, background }) =>
   return data;
 };
 
-/// `full` is the difference that the heat map shows in its last colour. Pictures hold colour and transmittance.
-export const present = full => `
+// Colours of the heat map, for differences of 0, 1/16, ..., 1/4.
+const HEAT = ['0.03, 0.03, 0.06', '0.32, 0.10, 0.45', '0.80, 0.26, 0.30', '0.98, 0.65, 0.18', '1.00, 0.98, 0.85'];
+
+/// Statements that set `color` for a `difference`, in GLSL and in WGSL. `vector` is the name of a type of three floats.
+export const heatMap = vector => [`color = ${vector}(${HEAT[0]});`, ...HEAT.slice(1).map((next, k) =>
+  `color = mix(color, ${vector}(${next}), clamp(16.0 * difference - ${k}.0, 0.0, 1.0));`)].join('\n  ');
+
+/// Pictures hold colour and transmittance.
+export const PRESENT = `
 struct Screen { background: vec3f, divider: f32, canvas: vec2f, difference: f32, unused: f32, size: vec2u }
 @group(0) @binding(0) var<uniform> screen: Screen;
 @group(0) @binding(1) var<storage, read> left: array<vec4f>;
@@ -20,12 +27,10 @@ struct Screen { background: vec3f, divider: f32, canvas: vec2f, difference: f32,
   return vec4f(select(-1.0, 3.0, i == 1u), select(-1.0, 3.0, i == 2u), 0.0, 1.0);
 }
 fn over(c: vec4f) -> vec3f { return clamp(c.xyz + c.w * screen.background, vec3f(0.0), vec3f(1.0)); }
-fn heat(part: f32) -> vec3f {
-  let k0 = vec3f(0.03, 0.03, 0.06); let k1 = vec3f(0.32, 0.10, 0.45); let k2 = vec3f(0.80, 0.26, 0.30);
-  let k3 = vec3f(0.98, 0.65, 0.18); let k4 = vec3f(1.00, 0.98, 0.85);
-  let t = part * 4.0;
-  if (t < 2.0) { return select(mix(k1, k2, t - 1.0), mix(k0, k1, t), t < 1.0); }
-  return select(mix(k3, k4, t - 3.0), mix(k2, k3, t - 2.0), t < 3.0);
+fn heat(difference: f32) -> vec3f {
+  var color: vec3f;
+  ${heatMap('vec3f')}
+  return color;
 }
 @fragment fn show(@builtin(position) at: vec4f) -> @location(0) vec4f {
   let pixel = min(vec2u(at.xy / screen.canvas * vec2f(screen.size)), screen.size - 1u);
@@ -34,7 +39,7 @@ fn heat(part: f32) -> vec3f {
   if (right[k].w < 0.0) { b = a; }  // beside a photograph
   if (screen.difference > 0.0) {
     let d = abs(a - b);
-    return vec4f(heat(min(max(d.x, max(d.y, d.z)) / ${full}, 1.0)), 1.0);
+    return vec4f(heat(max(d.x, max(d.y, d.z))), 1.0);
   }
   return vec4f(select(b, a, at.x < screen.divider), 1.0);
 }`;

@@ -1,9 +1,9 @@
-// WGSL of the projection, after csrc/core/project.h and camera/pinhole.h: one thread turns a Gaussian into a splat, and
-// counts its tiles.
+// WGSL of the projection, after csrc/core/project.h: a thread turns a Gaussian into a splat, and counts its tiles.
 
 import { support } from './bin.wgsl.js';
+import { shaderNumber } from './constants.js';
 import { KINDS } from './footprint.wgsl.js';
-import { FRAME, WORKGROUP, wgslNumber } from './frame.wgsl.js';
+import { FRAME, WORKGROUP } from './frame.wgsl.js';
 import { addHarmonics, sceneBytes } from './sh.js';
 
 // A Gaussian as the page gets it: `read` for its geometry, `number` for its harmonics.
@@ -29,7 +29,7 @@ fn gaussianOf(i: u32) -> Gaussian {
   var q: vec4f;
   q[last] = sqrt(max(1.0 - dot(v, v), 0.0));
   for (var k = 0u; k < 3u; k++) { q[(last + 1u + k) & 3u] = v[k]; }
-  return Gaussian(mean, c.y, vec3f(b, c.x) * ${wgslNumber(largest)}, q / length(q));
+  return Gaussian(mean, c.y, vec3f(b, c.x) * ${shaderNumber(largest)}, q / length(q));
 }`,
   type: 'u32',
   word: k => (k < 2 ? `unpack2x16float(harmonics[at + ${k}u])` : `unpack4x8snorm(harmonics[at + ${k}u]) * t1.y`),
@@ -60,8 +60,7 @@ export function project(kind, meta) {
 @group(0) @binding(5) var<storage, read_write> tiles: array<u32>;
 struct Gaussian { mean: vec3f, opacity: f32, scale: vec3f, q: vec4f }  // quaternion w x y z
 ${form.read}${support(kind)}${colorOf(meta, form)}
-// Keeps a compiler from fusing a product with a sum, which it cannot undo: frame.zero is 0 at run time only. Depths have
-// to be the rasterizer's to the last bit, since they order the splats.
+// Keeps products from being fused with sums: frame.zero is 0 at run time only. Depths order splats, to the last bit.
 fn rounded(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ frame.zero); }
 fn row(r: vec4f, p: vec3f) -> f32 {
   return rounded(rounded(rounded(rounded(r.x * p.x) + rounded(r.y * p.y)) + rounded(r.z * p.z)) + r.w);

@@ -1,5 +1,4 @@
-// Spherical harmonics, csrc/core/sh.h, as text that GLSL and WGSL have in common. (x, y, z) is the direction; xx, yy
-// and zz are the squares.
+// Spherical harmonics, csrc/core/sh.h, as text of GLSL and WGSL. (x, y, z) is the direction; xx, yy, zz are squares.
 
 const BASIS = [
   '0.28209479177387814',
@@ -12,8 +11,7 @@ const BASIS = [
   '-0.5900435899266435 * x * (xx - 3.0 * yy)',
 ];
 
-/// Statements that add the harmonics up to a degree to `color`. `number(k)` is text for number k of a Gaussian, and
-/// `vector` the name of a type of three floats.
+/// Statements that add the harmonics up to a degree to `color`. `number(k)` is text for number k, `vector` a type.
 export function addHarmonics(degree, number, vector) {
   return BASIS.slice(0, (degree + 1) ** 2).map((basis, k) =>
     `color += (${basis}) * ${vector}(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`).join('\n  ');
@@ -25,3 +23,10 @@ export const harmonicNumbers = degree => 4 * Math.ceil((3 * (degree + 1) ** 2) /
 /// Bytes of geometry and of harmonics of a Gaussian. `compact` is how small scenes are (viewer/compact.py).
 export const sceneBytes = ({ sh_degree: degree, compact }) => (compact
   ? [24, 8 + 4 * Math.ceil((3 * ((degree + 1) ** 2 - 1)) / 4)] : [48, 2 * harmonicNumbers(degree)]);
+
+/// An Error where a device has no room for a scene. `working` is what it takes beside, of each Gaussian [bytes].
+export function noRoom(meta, working) {
+  const [geometry, harmonics] = sceneBytes(meta), bytes = meta.count * (geometry + harmonics + working);
+  return new Error(
+    `The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its memory.`);
+}

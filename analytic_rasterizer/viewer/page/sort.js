@@ -1,19 +1,16 @@
-// A worker that orders Gaussians by depth. First message: {means, stride, count}, with the numbers of one Gaussian
-// `stride` apart. Then {row, near}: the row of the world-to-camera matrix that gives the depth. Answer: {order},
-// indices of what lies beyond `near`, the farthest first. Equal depths keep the rasterizer's order, in which the first
-// Gaussian of the input is in front.
+// A worker that orders Gaussians by depth. First message: {geometry, count} of the scene. Then {row, near}: the row of
+// the world-to-camera matrix that gives the depth. Answer: {order}, indices of what lies beyond `near`, the farthest
+// first. Equal depths keep the rasterizer's order, in which the first Gaussian of the input is in front.
 'use strict';
 
-let means, stride, count;
-let keys, keysB, indices, indicesB;
+const STRIDE = 12;  // numbers of a Gaussian in geometry
+
+let geometry, count, keys, keysB, indices, indicesB;
 
 onmessage = ({ data }) => {
-  if (data.means) {
-    ({ means, stride, count } = data);
-    keys = new Uint32Array(count);
-    keysB = new Uint32Array(count);
-    indices = new Uint32Array(count);
-    indicesB = new Uint32Array(count);
+  if (data.geometry) {
+    ({ geometry, count } = data);
+    [keys, keysB, indices, indicesB] = Array.from({ length: 4 }, () => new Uint32Array(count));
     return;
   }
   const visible = depths(data.row, data.near);
@@ -21,15 +18,15 @@ onmessage = ({ data }) => {
   postMessage({ order }, [order.buffer]);
 };
 
-/// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Positive floats are ordered as
-/// their bits are. The sum is rounded at every step as the rasterizer rounds it, so that the order is the same.
+/// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Sums are rounded at every step, as
+/// the rasterizer rounds them. Positive floats are ordered as their bits are.
 function depths(row, near) {
   const fround = Math.fround, values = new Float32Array(keys.buffer);
   const [x, y, z, w] = row, limit = fround(near);
   let visible = 0;
-  for (let i = 0, at = 0; i < count; ++i, at += stride) {
-    const xy = fround(fround(x * means[at]) + fround(y * means[at + 1]));
-    const depth = fround(fround(xy + fround(z * means[at + 2])) + w);
+  for (let i = 0, at = 0; i < count; ++i, at += STRIDE) {
+    const xy = fround(fround(x * geometry[at]) + fround(y * geometry[at + 1]));
+    const depth = fround(fround(xy + fround(z * geometry[at + 2])) + w);
     if (depth > limit) {
       values[visible] = depth;
       indices[visible++] = i;

@@ -1,6 +1,5 @@
 // WGSL of a stable radix sort of (key, value), 4 bits at a time: histograms of blocks of keys; for each digit a
-// workgroup adds them up over the blocks; scatter. No workgroup waits for another one, so that no forward progress is
-// needed, and no subgroups.
+// workgroup adds them up over the blocks; scatter. It needs no forward progress of workgroups, and no subgroups.
 
 import { WORKGROUP } from './frame.wgsl.js';
 

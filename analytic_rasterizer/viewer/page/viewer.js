@@ -15,9 +15,9 @@ const FLIGHT_SPEED = 0.7;       // distances of the target per second
 const LOSS_TIME = 500;          // ms in which a device that is lost says so
 
 export class Viewer {
-  /// `wish` and `bits` are those of openRenderer.
-  constructor(meta, wish, bits) {
-    Object.assign(this, { meta, wish, bits });
+  /// `wish` is that of openRenderer.
+  constructor(meta, wish) {
+    Object.assign(this, { meta, wish });
     this.surface = document.getElementById('surface');
     this.camera = new Camera(meta);
     this.state = {
@@ -39,8 +39,7 @@ export class Viewer {
 
   /// Opens a renderer for the scene, which is not here yet.
   async open() {
-    Object.assign(this, await openRenderer(this.meta, this.wish, this.bits));
-    this.canvas = this.renderer.canvas;
+    Object.assign(this, await openRenderer(this.meta, this.wish));
   }
 
   /// Takes the scene, which loadScene returned.
@@ -116,10 +115,8 @@ export class Viewer {
   }
 
   pan(x, y) {
-    const pinhole = this.pinhole(), ratio = window.devicePixelRatio || 1;
-    const { distance } = this.camera;
-    this.camera.move((-x * ratio * distance) / pinhole.fx, (-y * ratio * distance) / pinhole.fy, 0);
-    this.moved();
+    const { fx, fy } = this.pinhole(), ratio = window.devicePixelRatio || 1;
+    this.panBy((-x * ratio) / fx, (-y * ratio) / fy);
   }
 
   /// By parts of the distance.
@@ -134,14 +131,10 @@ export class Viewer {
   }
 
   focusOn(x, y) {
-    const pinhole = this.pinhole(), ratio = window.devicePixelRatio || 1;
-    const depth = depthAt(this.scene.geometry, pinhole, x * ratio, y * ratio);
-    if (depth === null) {
-      announce('There is nothing here to focus on.', READING_TIME);
-      return;
-    }
-    const point = add(this.camera.position, times(this.camera.ray(pinhole, x * ratio, y * ratio), depth));
-    this.travel(this.camera.poseTowards(point), () => {});
+    const { camera } = this, pinhole = this.pinhole(), at = [x, y].map(value => value * (window.devicePixelRatio || 1));
+    const depth = depthAt(this.scene.geometry, pinhole, ...at);
+    if (depth === null) announce('There is nothing here to focus on.', READING_TIME);
+    else this.travel(camera.poseTowards(add(camera.position, times(camera.ray(pinhole, ...at), depth))));
   }
 
   stepView(step) {
@@ -161,7 +154,7 @@ export class Viewer {
   }
 
   /// Moves to a pose, at once for people who prefer no motion.
-  travel(pose, arrived) {
+  travel(pose, arrived = () => {}) {
     const still = matchMedia('(prefers-reduced-motion: reduce)').matches;
     this.journey = { from: this.camera.pose, to: pose, start: still ? -Infinity : performance.now(), arrived };
     this.moved(true);
@@ -172,7 +165,7 @@ export class Viewer {
     if (!this.shown) return;
     const name = `${this.meta.name.replace(/\.\w+$/, '')}_${this.state.footprint.replace(/\W+/g, '_')}.png`;
     this.present();
-    this.canvas.toBlob(blob => {
+    this.renderer.canvas.toBlob(blob => {
       const link = document.createElement('a');
       link.href = URL.createObjectURL(blob);
       link.download = name;
@@ -183,9 +176,7 @@ export class Viewer {
   }
 
   /// An entry of the footprints. Throws for an unknown name.
-  footprint(name) {
-    return parseFootprint(name, this.meta.footprints);
-  }
+  footprint(name) { return parseFootprint(name, this.meta.footprints); }
 
   /// What is drawn for this name: a quicker footprint while the camera moves, and where the renderer cannot draw it.
   drawn(name, moving = false) {
@@ -225,9 +216,7 @@ export class Viewer {
     }, REST_AFTER + 20);  // timers may be early
   }
 
-  get moving() {
-    return performance.now() - this.movedAt < REST_AFTER;
-  }
+  get moving() { return performance.now() - this.movedAt < REST_AFTER; }
 
   /// Size of the canvas that fills the page [px].
   get size() {
@@ -290,8 +279,7 @@ export class Viewer {
     }
   }
 
-  /// Draws the state and shows it. Pictures are quicker and may be smaller while the camera moves; others are given up
-  /// when it begins to. False if there is no picture.
+  /// Draws and shows the state, quicker and smaller while the camera moves. False if it begins to: there is no picture.
   async drawFrame() {
     const { footprint, compare, mode, divisor, divider } = this.state, { moving } = this;
     const left = this.drawn(footprint, moving), alone = compare === null || compare === PHOTOGRAPH;
@@ -323,9 +311,10 @@ export class Viewer {
 
   /// Shows what was drawn last.
   present() {
-    const { mode, divider, background } = this.state, { left, right } = this.shown, [width, height] = this.size;
-    if (this.canvas.width !== width) this.canvas.width = width;
-    if (this.canvas.height !== height) this.canvas.height = height;
+    const { mode, divider, background } = this.state, { left, right } = this.shown, { canvas } = this.renderer;
+    const [width, height] = this.size;
+    if (canvas.width !== width) canvas.width = width;
+    if (canvas.height !== height) canvas.height = height;
     const difference = right !== null && mode === 'difference';
     this.renderer.present({ left, right, divider: divider * width, difference, background });
   }

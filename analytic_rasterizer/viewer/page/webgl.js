@@ -1,16 +1,18 @@
-// Draws with WebGL 2, where there is no WebGPU: footprints of one sample, blended back to front. A renderer
-// (renderers.js).
+// Draws with WebGL 2, where there is no WebGPU: footprints of one sample. A fragment per Gaussian projects it into a
+// splat; the splats are blended back to front, in the order of a worker. A renderer (renderers.js).
 
+import { eyeAndLimits } from './camera.js';
 import { CONSTANTS } from './constants.js';
 import { startSorter } from './load.js';
-import { Projection, largestCount } from './webgl_project.js';
+import { noRoom } from './sh.js';
 import {
-  FULL_SCREEN, GL_KINDS, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
+  FULL_SCREEN, GL_KINDS, GL_PRESENT, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader,
+  projectShader, texelsOfHarmonics,
 } from './webgl_shaders.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './webgl_tools.js';
+import { createFramebuffer, createProgram, createTexture, fillTexture, runProgram } from './webgl_tools.js';
 
-const GEOMETRY_STRIDE = 12;
-const POLL = 50;  // ms
+const WORKING_BYTES_OF_GL = 3 * 16 + 4;  // of a Gaussian beside the scene: projected, order
+const POLL = 50;                         // ms
 
 /// The worker, asked for one order at a time.
 class Sorter {
@@ -18,15 +20,12 @@ class Sorter {
     this.worker = startSorter();
     this.known = null;  // row of the matrix whose order is known
     this.busy = null;
-    this.worker.postMessage({ means: geometry, stride: GEOMETRY_STRIDE, count: meta.count });
+    this.worker.postMessage({ geometry, count: meta.count });
   }
 
-  knows(w2c) {
-    return this.known === w2c.slice(8, 12).join();
-  }
+  knows(w2c) { return this.known === w2c.slice(8, 12).join(); }
 
-  /// Asks for the indices of the Gaussians in front of a camera, the farthest first, unless the worker is at work.
-  /// `take` is called with them.
+  /// Asks for the order that a camera sees, unless the worker is at work. `take` is called with it.
   ask(w2c, take) {
     this.busy ??= new Promise((resolve, reject) => {
       this.worker.onmessage = ({ data }) => resolve(data.order);
@@ -42,24 +41,26 @@ class Sorter {
 }
 
 export class WebGLRenderer {
-  /// Throws an Error with a sentence where the browser or the device cannot do it. `bits` per channel that are blended,
-  /// at most: 8, 16, or 32 where the picture is settled.
-  static async create(canvas, meta, { bits = 32, fullDifference }) {
+  static async create(canvas, meta) {
     const gl = canvas.getContext('webgl2', {
       antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance',
     });
     if (!gl) throw new Error('This viewer needs WebGPU or WebGL 2, which this browser or this machine does not offer.');
+    if (!gl.getExtension('EXT_color_buffer_float')) {
+      throw new Error('This viewer needs WebGPU, or WebGL 2 that draws into floats, which this device does not.');
+    }
     if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < 4096) throw new Error('This viewer needs textures of 4096 pixels.');
-    const { count, sh_degree: degree } = meta, most = largestCount(gl.getParameter(gl.MAX_TEXTURE_SIZE), degree);
+    const { count, sh_degree: degree } = meta, largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    const most = largest * Math.min(SPLATS_PER_ROW, Math.floor(largest / texelsOfHarmonics(degree)));
     if (count > most) {
       throw new Error(`The scene has ${count.toLocaleString('en')} Gaussians; this device can hold ` +
         `${most.toLocaleString('en')} of spherical harmonics of degree ${degree}.`);
     }
-    return new WebGLRenderer(canvas, gl, bits, fullDifference);
+    return new WebGLRenderer(canvas, gl);
   }
 
-  constructor(canvas, gl, bits, fullDifference) {
-    Object.assign(this, { canvas, gl, fullDifference });
+  constructor(canvas, gl) {
+    Object.assign(this, { canvas, gl });
     this.name = 'WebGL 2';
     this.isLost = false;
     this.lost = new Promise(resolve => canvas.addEventListener('webglcontextlost', event => {
@@ -68,42 +69,39 @@ export class WebGLRenderer {
       resolve();
     }, { once: true }));
     this.returned = new Promise(resolve => canvas.addEventListener('webglcontextrestored', resolve, { once: true }));
-    const halves = gl.getExtension('EXT_color_buffer_float') ?? gl.getExtension('EXT_color_buffer_half_float');
-    const floats = gl.getExtension('EXT_color_buffer_float') && gl.getExtension('EXT_float_blend');
-    this.bits = halves ? bits : 8;
-    const full = [gl.RGBA32F, gl.RGBA, gl.FLOAT], half = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
-    const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
+    this.floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
+    this.halves = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
     // Half floats are quick, but some devices cut them off at every blend where others round.
-    this.quickFormat = this.bits === 8 ? bytes : half;
-    this.settledFormat = this.bits === 8 ? bytes : floats && bits !== 16 ? full : half;
+    this.settledFormat = gl.getExtension('EXT_float_blend') ? this.floats : this.halves;
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    const corner = (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6];
+    const corners = Uint16Array.from({ length: 6 * SPLATS_PER_INSTANCE }, corner);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     this.programs = new Map();
     this.pictures = new Map();
-    this.fullScreen = gl.createVertexArray();
-    this.quads = this.createQuads();
   }
 
-  /// Throws an Error with a sentence where the device cannot hold the scene.
-  async load(scene) {
-    this.projection = new Projection(this.gl, scene);
-    this.sorter = new Sorter(scene);
+  async load({ meta, geometry, harmonics }) {
+    const { gl, floats, halves } = this, rows = Math.ceil(meta.count / SPLATS_PER_ROW);
+    const words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
+    this.orderFormat = [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT];
+    const texels = texelsOfHarmonics(meta.sh_degree);
+    const perRow = Math.floor(gl.getParameter(gl.MAX_TEXTURE_SIZE) / texels);
+    this.geometry = createTexture(gl, 3 * SPLATS_PER_ROW, rows, floats);
+    this.harmonics = createTexture(gl, texels * perRow, Math.ceil(meta.count / perRow), halves);
+    this.order = createTexture(gl, SPLATS_PER_ROW, rows, this.orderFormat);
+    this.splats = [0, 1, 2].map(() => createTexture(gl, SPLATS_PER_ROW, rows, words));
+    fillTexture(gl, this.geometry, 3 * SPLATS_PER_ROW, floats, 4, geometry);
+    fillTexture(gl, this.harmonics, texels * perRow, halves, 4, harmonics);
+    if (gl.getError() === gl.OUT_OF_MEMORY) throw noRoom(meta, WORKING_BYTES_OF_GL);
+    Object.assign(this, { rows, degree: meta.sh_degree, projected: createFramebuffer(gl, this.splats) });
+    this.sorter = new Sorter({ meta, geometry });
   }
 
-  draws({ kind, samples }) {
-    return samples === 1 && kind in GL_KINDS;
-  }
+  draws({ kind, samples }) { return samples === 1 && kind in GL_KINDS; }
 
-  /// Triangles of SPLATS_PER_INSTANCE quads, whose corners the vertex shader numbers.
-  createQuads() {
-    const gl = this.gl, quads = gl.createVertexArray();
-    const indices = new Uint16Array(6 * SPLATS_PER_INSTANCE);
-    for (let i = 0; i < SPLATS_PER_INSTANCE; ++i) indices.set([0, 1, 2, 2, 1, 3].map(k => 4 * i + k), 6 * i);
-    gl.bindVertexArray(quads);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
-    return quads;
-  }
-
+  /// A program, made once. `vertex` and `fragment` return sources.
   program(key, vertex, fragment) {
     if (!this.programs.has(key)) this.programs.set(key, createProgram(this.gl, vertex(), fragment()));
     return this.programs.get(key);
@@ -123,28 +121,25 @@ export class WebGLRenderer {
     return made;
   }
 
-  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
-  put(name, { width, height }, values) {
-    const { gl } = this, format = [gl.RGBA32F, gl.RGBA, gl.FLOAT];
-    gl.deleteTexture(this.pictures.get(name)?.texture ?? null);
-    const texture = createTexture(gl, width, height, format);
-    fillTexture(gl, texture, width, format, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
-    this.pictures.set(name, { width, height, texture });
+  put(name, size, values) {
+    const { texture, width } = this.picture(name, size, this.floats);
+    fillTexture(this.gl, texture, width, this.floats, 4, values.map((value, at) => (at % 4 === 3 ? 1 - value : value)));
   }
 
-  /// Draws pictures, each {name, footprint, span}, of which the columns from span[0] on up to span[1] are needed [px];
-  /// `settled` ones as exactly as the device can. False if `cancelled` has become true; there is no picture then.
   async draw({ camera, pictures, settled, cancelled = () => false }) {
     const { sorter } = this;
     while (!sorter.knows(camera.w2c)) {
-      const order = sorter.ask(camera.w2c, found => { if (!this.isLost) this.projection.setOrder(found); });
+      const order = sorter.ask(camera.w2c, found => { if (!this.isLost) this.setOrder(found); });
       // An order that is a little old will do while the camera moves.
       if (!settled && sorter.known !== null) break;
       await Promise.race([order, new Promise(resolve => setTimeout(resolve, POLL))]);
       if (cancelled()) return false;
     }
     this.complain();
-    for (const { name, footprint, span } of pictures) this.drawPicture(name, camera, footprint, settled, span);
+    for (const { name, footprint, span } of pictures) {
+      this.project(camera, footprint);
+      this.blend(this.picture(name, camera, settled ? this.settledFormat : this.halves), footprint, span);
+    }
     await this.finished();
     this.complain();
     return true;
@@ -154,29 +149,35 @@ export class WebGLRenderer {
     if (this.isLost || this.gl.isContextLost()) throw new Error('The graphics device was lost.');
   }
 
-  drawPicture(name, camera, footprint, settled, span = [0, camera.width]) {
-    const gl = this.gl, { width, height } = camera, { projection } = this;
-    const picture = this.picture(name, camera, settled ? this.settledFormat : this.quickFormat);
-    projection.project(camera, footprint);
-    const { program, uniforms } = this.program(
-      `draw ${footprint.kind}`, () => drawVertexShader(footprint.kind), () => drawFragmentShader(footprint.kind));
-    gl.viewport(0, 0, width, height);
-    gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(span[0], 0, Math.max(span[1] - span[0], 0), height);
-    gl.useProgram(program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, picture.framebuffer);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    const [uMean, uWhitening, uColor] = projection.splats;
-    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: projection.order });
-    gl.uniform1i(uniforms.uVisible, projection.visible);
-    gl.uniform2f(uniforms.uSize, width, height);
-    gl.bindVertexArray(this.quads);
-    const instances = Math.ceil(projection.visible / SPLATS_PER_INSTANCE);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * SPLATS_PER_INSTANCE, gl.UNSIGNED_SHORT, 0, instances);
-    gl.disable(gl.SCISSOR_TEST);
+  /// Takes indices of Gaussians, the farthest first.
+  setOrder(order) {
+    fillTexture(this.gl, this.order, SPLATS_PER_ROW, this.orderFormat, 1, order);
+    this.visible = order.length;
+  }
+
+  /// Projects all Gaussians for a footprint, replacing the splats of the last call.
+  project(camera, { kind, variance }) {
+    const { eye, limits } = eyeAndLimits(camera), { fx, fy, cx, cy, w2c } = camera;
+    const program = this.program(`project ${kind}`, () => FULL_SCREEN, () => projectShader(kind, this.degree));
+    runProgram(this.gl, program, {
+      framebuffer: this.projected, width: SPLATS_PER_ROW, height: this.rows,
+      textures: { uGeometry: this.geometry, uHarmonics: this.harmonics },
+      uniforms: {
+        uView: w2c.slice(0, 12), uEye: eye, uPinhole: [fx, fy, cx, cy], uLimit: limits, uVariance: [variance],
+      },
+    });
+  }
+
+  /// Blends the splats of the last projection into a picture, back to front.
+  blend(picture, { kind }, columns) {
+    const program = this.program(`blend ${kind}`, () => drawVertexShader(kind), () => drawFragmentShader(kind));
+    const [uMean, uWhitening, uColor] = this.splats;
+    runProgram(this.gl, program, {
+      ...picture, columns, blends: true,
+      quads: { indices: 6 * SPLATS_PER_INSTANCE, instances: Math.ceil(this.visible / SPLATS_PER_INSTANCE) },
+      textures: { uMean, uWhitening, uColor, uOrder: this.order },
+      uniforms: { uSize: [picture.width, picture.height], uVisible: [this.visible] },
+    });
   }
 
   /// Resolves when the device has drawn everything, or is lost.
@@ -189,46 +190,27 @@ export class WebGLRenderer {
     gl.deleteSync(fence);
   }
 
-  /// Shows the picture `left`, beside it from column `divider` of the canvas on `right`, or the difference of the two.
   present({ left, right = null, divider = 0, difference = false, background }) {
-    const gl = this.gl, { width, height } = this.canvas;
-    const a = this.pictures.get(left), b = this.pictures.get(right ?? left);
-    const { program, uniforms } = this.program('present', () => FULL_SCREEN, () => PRESENT);
-    gl.useProgram(program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    gl.disable(gl.BLEND);
-    bindTextures(gl, uniforms, { uLeft: a.texture, uRight: b.texture });
-    gl.uniform2f(uniforms.uCanvas, width, height);
-    gl.uniform2f(uniforms.uSize, a.width, a.height);
-    gl.uniform3f(uniforms.uBackground, ...background);
-    gl.uniform1f(uniforms.uDivider, right === null ? width : divider);
-    gl.uniform1i(uniforms.uDifference, difference ? 1 : 0);
-    gl.uniform1f(uniforms.uFull, this.fullDifference);
-    gl.bindVertexArray(this.fullScreen);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    const { width, height } = this.canvas, a = this.pictures.get(left), b = this.pictures.get(right ?? left);
+    runProgram(this.gl, this.program('present', () => FULL_SCREEN, () => GL_PRESENT), {
+      framebuffer: null, width, height, textures: { uLeft: a.texture, uRight: b.texture },
+      uniforms: {
+        uCanvas: [width, height], uSize: [a.width, a.height], uBackground: background,
+        uDivider: [right === null ? width : divider], uDifference: [difference ? 1 : 0],
+      },
+    });
   }
 
-  /// Colour and transmittance of a picture: four numbers a pixel. Rejects where there is none, as after the device was
-  /// lost.
   async read(name) {
     const gl = this.gl, picture = this.pictures.get(name);
     if (!picture || gl.isContextLost()) throw new Error('There is no picture: the graphics device was lost since.');
-    const { framebuffer, width, height } = picture, pixels = width * height;
+    const { framebuffer, width, height } = picture;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    let values = new Float32Array(4 * pixels);
-    if (this.bits === 8) {
-      const bytes = new Uint8Array(4 * pixels);
-      gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-      values = Float32Array.from(bytes, byte => byte / 255);
-    } else {
-      gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
-    }
+    const values = new Float32Array(4 * width * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
     if (gl.isContextLost()) throw new Error('The graphics device was lost while the picture was read.');
     return values.map((value, at) => (at % 4 === 3 ? 1 - value : value));
   }
 
-  dispose() {
-    this.sorter?.worker.terminate();
-  }
+  dispose() { this.sorter?.worker.terminate(); }
 }

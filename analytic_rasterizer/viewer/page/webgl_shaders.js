@@ -1,34 +1,28 @@
-// GLSL of the passes: project, draw, present. The formulas are those of csrc/core, in the same form.
-//
-// Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
-// wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
-// GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
+// GLSL of the passes project, blend and present, after csrc/core. Everything is highp: 16 bits are too few. Offsets are
+// floor(gl_FragCoord) - mean, not interpolated, which is exact. Forms stay positive however a compiler rounds them.
 
-import { CONSTANTS, MINIMAX } from './constants.js';
+import { CONSTANTS, MINIMAX, shaderNumber } from './constants.js';
+import { heatMap } from './present.wgsl.js';
 import { addHarmonics, harmonicNumbers } from './sh.js';
 
 // Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
 export const SPLATS_PER_INSTANCE = 4096;
 // Splats in a row of the textures that have one texel, or three, per splat.
 export const SPLATS_PER_ROW = 1024;
-// Quads are this much larger on all sides [px], because vertices may snap to 1/16 px.
-const QUAD_MARGIN = 0.25;
-
-const glslNumber = value => (Number.isInteger(value) ? value.toFixed(1) : value.toPrecision(17));
 
 const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
-${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glslNumber(value)};`).join('\n')}
+${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${shaderNumber(value)};`).join('\n')}
 `;
 
 // F(t) of docs/internals/numerics.md, "Logistic window", as numerator and denominator. `r` = 1/sigma [1/px].
 const GL_WINDOW = `
 float logistic2(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }
 float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
-  float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
+  float series = ${MINIMAX.map(shaderNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
   return x < 0.5 ? x * series : 1.0 - e;
 }
 vec2 window(float t, float r) {
@@ -72,9 +66,6 @@ export function projectShader(kind, degree) {
   float amplitude = ${kind === 'gaussian' ? '1.0' : 'sqrt(det / blurredDet)'};
   peak = log2(opacity * amplitude);
   level = 2.0 * log(opacity * amplitude / kAlphaMin);`;
-  const cumulants = `${gaussian}
-  vec2 conic = vec2(dot(whitening.xz, whitening.xz), dot(whitening.yw, whitening.yw));
-  level += dot(conic, conic) / 124.0;`;
   const turned = `
   float dx = xx - yy, dy = 2.0 * xy, gap = length(vec2(dx, dy)), major = 0.5 * (xx + yy + gap);
   float s1 = max(sqrt(major), kMinSigma), s2 = max(sqrt(det / max(major, 1e-30)), kMinSigma);
@@ -94,7 +85,6 @@ export function projectShader(kind, degree) {
   level = 2.0 * log(peak * top.x / top.y / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
   return `${HEAD}
 uniform sampler2D uGeometry, uHarmonics;
-uniform int uCount, uHarmonicsPerRow;
 uniform vec4 uView[3];  // rows of world to camera
 uniform vec3 uEye;
 uniform vec4 uPinhole;  // focal lengths and principal point [px]
@@ -108,7 +98,6 @@ void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
   outMean = outWhitening = outColor = uvec4(0);
-  if (i >= uCount) return;
   ivec2 texel = ivec2(3 * pixel.x, pixel.y);
   vec4 g0 = texelFetch(uGeometry, texel, 0), g1 = texelFetch(uGeometry, texel + ivec2(1, 0), 0);
   vec4 q = texelFetch(uGeometry, texel + ivec2(2, 0), 0);
@@ -134,10 +123,11 @@ void main() {
   if (!(det < kMaxDet && xx < 1e18 && yy < 1e18)) return;
   vec4 whitening;
   float peak, level;
-${{ window: turned, cumulants }[kind] ?? gaussian}
+${kind === 'window' ? turned : gaussian}
   if (!(level > 0.0 && level < 1e6)) return;
 
-  ivec2 at = ivec2((i % uHarmonicsPerRow) * ${texelsOfHarmonics(degree)}, i / uHarmonicsPerRow);
+  int texels = ${texelsOfHarmonics(degree)}, perRow = textureSize(uHarmonics, 0).x / texels;
+  ivec2 at = ivec2(i % perRow * texels, i / perRow);
   outMean = floatBitsToUint(vec4(mean, sqrt(level + kLevelSlack), peak));
   outWhitening = floatBitsToUint(whitening);
   outColor = floatBitsToUint(vec4(colorSeenFrom(normalize(position - uEye), at), 0.0));
@@ -145,85 +135,56 @@ ${{ window: turned, cumulants }[kind] ?? gaussian}
 `;
 }
 
-// What differs between kinds of footprints: `varyings` go from vertex to fragment shader, `set` computes them from
-// whitening matrix W and peak, `alpha` is the body of a function of d = pixel - mean [px].
-const GL_GAUSSIAN = {
-  varyings: ['vec4 fW', 'float fPeak'],
-  set: 'fW = kBase2 * W; fPeak = peak;',
-  alpha: 'vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)); return exp2(fPeak - dot(z, z));',
-};
+// What the splat adds at d = pixel - mean [px], by the kind of its footprint.
+const GL_GAUSSIAN = `
+float alphaAt(vec2 d) {
+  vec2 z = kBase2 * vec2(dot(fW.xy, d), dot(fW.zw, d));
+  return exp2(fPeak - dot(z, z));
+}
+`;
 export const GL_KINDS = {
   gaussian: GL_GAUSSIAN,
   compensated: GL_GAUSSIAN,
-  cumulants: {
-    varyings: ['vec4 fW', 'vec4 fX', 'vec4 fY', 'float fPeak'],  // fX, fY: c4, c6, linear, cap
-    functions: {
-      vertex: `
-vec4 cumulantAxis(float t, float unit, float scale) {
-  float x = t * scale * kPixelVariance;
-  float u2 = unit * scale * scale, u3 = u2 * scale, u4 = u3 * scale, u6 = u4 * scale * scale;
-  float c4 = u4 * (1.0 + x * (20.0 / 7.0 + x * 0.4366)), c6 = u6 * max(1.0 - x, 1e-6) / 63.0;
-  float linear = u3 * 6.0 * t * (1.0 + x * (10.0 / 7.0 + x * 0.6240));
-  return vec4(c4, c6, linear, (c4 + sqrt(c4 * c4 - 3.0 * c6 * linear)) / (3.0 * c6));
+  window: `${GL_WINDOW}
+float alphaAt(vec2 d) {
+  vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
+  return fPeak * (u.x * v.x) / (u.y * v.y);
 }
-float cumulantConstant(float t, float unit, float scale) {
-  float x = t * scale * kPixelVariance;
-  return unit * scale * scale * 3.0 * t * t * (1.0 + x * (20.0 / 21.0 + x * 0.6975));
-}`,
-    },
-    set: `fW = kBase2 * W;
-  float unit = kOrder4 * kLog2e, scale = 1.0 / (kBase2 * kBase2);
-  float a = dot(fW.xz, fW.xz), c = dot(fW.yw, fW.yw);
-  fX = cumulantAxis(a, unit, scale);
-  fY = cumulantAxis(c, unit, scale);
-  fPeak = peak - cumulantConstant(a, unit, scale) - cumulantConstant(c, unit, scale);`,
-    alpha: `vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)), p = vec2(dot(fW.xz, z), dot(fW.yw, z));
-  vec2 P = min(p * p, vec2(fX.w, fY.w));
-  vec2 h = vec2(P.x * (P.x * (fX.x - fX.y * P.x) - fX.z), P.y * (P.y * (fY.x - fY.y * P.y) - fY.z));
-  return exp2(fPeak - dot(z, z) - h.y - h.x);`,
-  },
-  window: {
-    varyings: ['vec4 fW', 'vec2 fR', 'float fPeak'],
-    functions: { fragment: GL_WINDOW },
-    set: 'fW = W; fR = vec2(length(W.xy), length(W.zw)); fPeak = peak;',
-    alpha: `vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
-  return fPeak * (u.x * v.x) / (u.y * v.y);`,
-  },
+`,
 };
 
-const declare = (kind, direction) =>
-  GL_KINDS[kind].varyings.map(varying => `flat ${direction} highp ${varying};`).join('\n');
+// Of a splat, from vertex to fragment shader. fR: lengths of the rows of the whitening matrix fW.
+const varyings = direction => `
+flat ${direction} highp vec4 fW;
+flat ${direction} highp vec3 fColor;
+flat ${direction} highp vec2 fMean, fR;
+flat ${direction} highp float fPeak;
+`;
 
-/// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses.
+/// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses, of `window` wider by the pixel's variance.
 export function drawVertexShader(kind) {
-  const ellipse = kind === 'window'
-    ? 'vec2 r = vec2(length(W.xy), length(W.zw)), shrink = inversesqrt(1.0 + kPixelVariance * r * r);\n' +
-      '  vec4 E = vec4(W.xy * shrink.x, W.zw * shrink.y);'
-    : 'vec4 E = W;';
   return `${HEAD}
 uniform usampler2D uMean, uWhitening, uColor, uOrder;
-uniform int uVisible;
+uniform float uVisible;
 uniform vec2 uSize;
-flat out highp vec2 fMean;
-flat out highp vec3 fColor;
-${declare(kind, 'out')}
-${GL_KINDS[kind].functions?.vertex ?? ''}
+${varyings('out')}
 ivec2 texelOf(int k) { return ivec2(k % ${SPLATS_PER_ROW}, k / ${SPLATS_PER_ROW}); }
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: not drawn
   int k = gl_InstanceID * ${SPLATS_PER_INSTANCE} + gl_VertexID / 4;
-  if (k >= uVisible) return;
+  if (k >= int(uVisible)) return;
   ivec2 texel = texelOf(int(texelFetch(uOrder, texelOf(k), 0).x));
   vec4 m = uintBitsToFloat(texelFetch(uMean, texel, 0));
   if (!(m.z > 0.0)) return;
-  vec4 W = uintBitsToFloat(texelFetch(uWhitening, texel, 0));
-  float peak = m.w;
   fMean = m.xy;
+  fPeak = m.w;
+  fW = uintBitsToFloat(texelFetch(uWhitening, texel, 0));
+  fR = vec2(length(fW.xy), length(fW.zw));
   fColor = uintBitsToFloat(texelFetch(uColor, texel, 0)).xyz;
-  ${GL_KINDS[kind].set}
-  ${ellipse}
+  vec2 shrink = ${kind === 'window' ? 'inversesqrt(1.0 + kPixelVariance * fR * fR)' : 'vec2(1.0)'};
+  vec4 E = vec4(fW.xy * shrink.x, fW.zw * shrink.y);
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
-  const float margin = ${glslNumber(QUAD_MARGIN)};
+  const float margin = 0.25;  // px on all sides, because vertices may snap to 1/16 px
   vec2 s = corner * (m.z + margin * vec2(abs(E.x) + abs(E.y), abs(E.z) + abs(E.w)));
   vec2 offset = vec2(E.w * s.x - E.y * s.y, E.x * s.y - E.z * s.x) / (E.x * E.w - E.y * E.z);
   gl_Position = vec4((m.xy + offset + 0.5) / uSize * 2.0 - 1.0, 0.0, 1.0);
@@ -232,16 +193,10 @@ void main() {
 }
 
 /// Writes premultiplied colour and alpha.
-export function drawFragmentShader(kind) {
-  return `${HEAD}
-flat in highp vec2 fMean;
-flat in highp vec3 fColor;
-${declare(kind, 'in')}
+export const drawFragmentShader = kind => `${HEAD}
+${varyings('in')}
 out vec4 color;
-${GL_KINDS[kind].functions?.fragment ?? ''}
-float alphaAt(vec2 d) {
-  ${GL_KINDS[kind].alpha}
-}
+${GL_KINDS[kind]}
 void main() {
   float raw = alphaAt(floor(gl_FragCoord.xy) - fMean);
   if (!(raw >= kAlphaMin)) discard;
@@ -249,26 +204,20 @@ void main() {
   color = vec4(fColor * alpha, alpha);
 }
 `;
-}
 
 /// Shows one picture, two beside each other, or their difference. Row 0 of a picture is its top.
-export const PRESENT = `${HEAD}
+export const GL_PRESENT = `${HEAD}
 uniform sampler2D uLeft, uRight;
 uniform vec2 uCanvas, uSize;
 uniform vec3 uBackground;
 uniform float uDivider;  // canvas px; right of it is uRight
 uniform bool uDifference;
-uniform float uFull;     // difference of the last colour
 out vec4 color;
-vec3 over(vec4 c) {
-  return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0);
-}
-vec3 heat(float t) {
-  const vec3 k0 = vec3(0.03, 0.03, 0.06), k1 = vec3(0.32, 0.10, 0.45), k2 = vec3(0.80, 0.26, 0.30),
-             k3 = vec3(0.98, 0.65, 0.18), k4 = vec3(1.00, 0.98, 0.85);
-  t *= 4.0;
-  if (t < 2.0) return t < 1.0 ? mix(k0, k1, t) : mix(k1, k2, t - 1.0);
-  return t < 3.0 ? mix(k2, k3, t - 2.0) : mix(k3, k4, t - 3.0);
+vec3 over(vec4 c) { return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0); }
+vec3 heat(float difference) {
+  vec3 color;
+  ${heatMap('vec3')}
+  return color;
 }
 void main() {
   vec2 at = vec2(gl_FragCoord.x, uCanvas.y - gl_FragCoord.y);
@@ -276,6 +225,6 @@ void main() {
   vec4 a = texelFetch(uLeft, texel, 0), b = texelFetch(uRight, texel, 0);
   if (b.a > 1.5) b = a;  // beside a photograph
   vec3 d = abs(over(a) - over(b));
-  color = vec4(uDifference ? heat(min(max(d.r, max(d.g, d.b)) / uFull, 1.0)) : over(at.x < uDivider ? a : b), 1.0);
+  color = vec4(uDifference ? heat(max(d.r, max(d.g, d.b))) : over(at.x < uDivider ? a : b), 1.0);
 }
 `;

@@ -1,6 +1,6 @@
 // What every pass needs of WebGL2: programs, textures and framebuffers.
 
-/// A linked program and the places of its uniforms.
+/// A linked program, and room for the places of its uniforms.
 export function createProgram(gl, vertex, fragment) {
   const program = gl.createProgram();
   const shaders = [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]].map(([type, source]) => {
@@ -15,13 +15,7 @@ export function createProgram(gl, vertex, fragment) {
     const reason = shaders.map(shader => gl.getShaderInfoLog(shader)).join(' ') + gl.getProgramInfoLog(program);
     throw new Error(`This browser's graphics driver rejects a shader: ${reason.trim()}`);
   }
-  const uniforms = {};
-  const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) ?? 0;
-  for (let i = 0; i < count; ++i) {
-    const name = gl.getActiveUniform(program, i).name.replace('[0]', '');
-    uniforms[name] = gl.getUniformLocation(program, name);
-  }
-  return { program, uniforms };
+  return { program, places: {} };
 }
 
 /// A texture without filtering. `format` is [internal format, format, type].
@@ -55,18 +49,29 @@ export function createFramebuffer(gl, textures) {
   textures.forEach((texture, i) =>
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, texture, 0));
   gl.drawBuffers(textures.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
-  const status = gl.checkFramebufferStatus(gl.FRAMEBUFFER);
-  if (status !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
-    throw new Error(`This browser cannot draw into the textures that the viewer needs (status ${status}).`);
-  }
   return framebuffer;
 }
 
-/// Binds textures to the uniforms of these names, in order.
-export function bindTextures(gl, uniforms, textures) {
+/// Draws a triangle or quads into `columns` of a framebuffer, or of the canvas for null. `textures` and `uniforms` are by
+/// their names in the shaders; a uniform is a list of floats, or a flat one of vectors of four.
+export function runProgram(gl, { program, places }, target) {
+  const { framebuffer, width, height, columns = [0, width], blends = false, textures, uniforms, quads } = target;
+  const placeOf = name => places[name] ??= gl.getUniformLocation(program, name);
+  gl.useProgram(program);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.viewport(0, 0, width, height);
+  gl.enable(gl.SCISSOR_TEST);
+  gl.scissor(columns[0], 0, Math.max(columns[1] - columns[0], 0), height);
+  gl[blends ? 'enable' : 'disable'](gl.BLEND);
+  if (blends) gl.clear(gl.COLOR_BUFFER_BIT);
   Object.entries(textures).forEach(([name, texture], unit) => {
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.uniform1i(uniforms[name], unit);
+    gl.uniform1i(placeOf(name), unit);
   });
+  for (const [name, values] of Object.entries(uniforms)) {
+    gl[`uniform${Math.min(values.length, 4)}fv`](placeOf(name), values);
+  }
+  if (quads) gl.drawElementsInstanced(gl.TRIANGLES, quads.indices, gl.UNSIGNED_SHORT, 0, quads.instances);
+  else gl.drawArrays(gl.TRIANGLES, 0, 3);
 }

@@ -2,17 +2,16 @@
 
 import { KINDS, sampling } from './footprint.wgsl.js';
 import { TILE, frameData } from './frame.wgsl.js';
-import { SCREEN_BYTES, present, screenData } from './present.wgsl.js';
-import { sceneBytes } from './sh.js';
-import { Passes, STAGES, largestBinding, tilesOf } from './webgpu_passes.js';
+import { PRESENT, SCREEN_BYTES, screenData } from './present.wgsl.js';
+import { noRoom } from './sh.js';
+import { Passes, STAGES, WORKING_BYTES, largestBinding, tilesOf } from './webgpu_passes.js';
 
 const BAND_TIME = 250;   // ms that the device may blend at a stretch: systems end what seems to hang
 const FIRST_BANDS = 8;   // of a picture, as long as nothing has been measured
 const GROWTH = 1.25;     // of the room for pairs
 
 export class WebGPURenderer {
-  /// Throws an Error, whose message completes "WebGL 2 draws: ", where the browser or the device cannot do it.
-  static async create(canvas, meta, { software = false, fullDifference }) {
+  static async create(canvas, meta, software) {
     if (!navigator.gpu) throw new Error('this browser has no WebGPU.');
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: 'high-performance' });
     if (!adapter) throw new Error('WebGPU finds no graphics device here.');
@@ -33,11 +32,11 @@ export class WebGPURenderer {
     const device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
     const context = canvas.getContext('webgpu');
     if (!context) throw new Error('WebGPU cannot draw into the page.');
-    return new WebGPURenderer(canvas, context, device, fullDifference);
+    return new WebGPURenderer(canvas, context, device);
   }
 
-  constructor(canvas, context, device, fullDifference) {
-    Object.assign(this, { canvas, context, device, fullDifference });
+  constructor(canvas, context, device) {
+    Object.assign(this, { canvas, context, device });
     this.name = 'WebGPU';
     this.pictures = new Map();
     this.rate = null;    // ms for a sample of a pair
@@ -50,7 +49,7 @@ export class WebGPURenderer {
     device.addEventListener('uncapturederror', ({ error }) => { this.error ??= error.message; });
     const format = navigator.gpu.getPreferredCanvasFormat();
     context.configure({ device, format, alphaMode: 'opaque' });
-    const module = device.createShaderModule({ code: present(fullDifference) });
+    const module = device.createShaderModule({ code: PRESENT });
     this.show = device.createRenderPipeline({
       layout: 'auto', vertex: { module, entryPoint: 'corner' },
       fragment: { module, entryPoint: 'show', targets: [{ format }] },
@@ -60,13 +59,9 @@ export class WebGPURenderer {
     this.numbers = device.createBuffer({ size: 16 + 16 * STAGES.length, usage: MAP_READ | COPY_DST });
   }
 
-  /// Throws an Error with a sentence where the device has no room.
   async load(scene) {
-    if (!await this.fits(() => { this.passes = new Passes(this.device, scene); })) {
-      const [geometry, harmonics] = sceneBytes(scene.meta), bytes = scene.meta.count * (68 + geometry + harmonics);
-      throw new Error(`The graphics device has no room for the scene, which takes ${Math.ceil(bytes / 1e6)} MB of its ` +
-        'memory.');
-    }
+    if (await this.fits(() => { this.passes = new Passes(this.device, scene); })) return;
+    throw noRoom(scene.meta, WORKING_BYTES);
   }
 
   /// Whether the device had the memory for what `make` does.
@@ -76,12 +71,8 @@ export class WebGPURenderer {
     return await this.device.popErrorScope() === null;
   }
 
-  draws({ kind }) {
-    return kind in KINDS;
-  }
+  draws({ kind }) { return kind in KINDS; }
 
-  /// Draws pictures, each {name, footprint, span}, of which the columns from span[0] on up to span[1] are needed [px].
-  /// False if `cancelled` has become true; there is no picture then.
   draw(request) {
     const drawn = this.turn.then(() => this.drawNow(request));
     this.turn = drawn.catch(() => {});  // buffers are for one picture at a time
@@ -120,7 +111,6 @@ export class WebGPURenderer {
     return made;
   }
 
-  /// Takes a picture from elsewhere: colour and transmittance, which is -1 where the other picture is to be shown.
   put(name, size, values) {
     this.device.queue.writeBuffer(this.picture(name, size).buffer, 0, values);
   }
@@ -153,7 +143,7 @@ export class WebGPURenderer {
       }
       this.pairs = wanted;
       if (passes.queries) this.noteStages(new BigUint64Array(numbers, 16), bands === 1 ? STAGES : STAGES.slice(0, -1));
-      if (bands === 1) this.measure(footprint, performance.now() - start, wanted);
+      if (bands === 1) this.rate = (performance.now() - start) / (Math.max(wanted, 1) * footprint.samples);
       return bands === 1 || await this.blendInBands(blended, footprint, top, bottom, bands, cancelled);
     }
   }
@@ -180,10 +170,6 @@ export class WebGPURenderer {
     }
   }
 
-  measure(footprint, milliseconds, pairs) {
-    this.rate = milliseconds / (Math.max(pairs, 1) * footprint.samples);
-  }
-
   async blendInBands(blended, footprint, top, bottom, bands, cancelled) {
     const height = Math.ceil((bottom - top) / bands), start = performance.now();
     for (let row = top; row < bottom; row += height) {
@@ -194,12 +180,11 @@ export class WebGPURenderer {
       await this.device.queue.onSubmittedWorkDone();
     }
     const took = performance.now() - start;
-    this.measure(footprint, took, this.pairs);
+    this.rate = took / (Math.max(this.pairs, 1) * footprint.samples);
     if (this.passes.queries) this.stages.blend = (this.stages.blend ?? 0) + took;
     return true;
   }
 
-  /// Shows the picture `left`, beside it from column `divider` of the canvas on `right`, or the difference of the two.
   present({ left, right = null, divider = 0, difference = false, background }) {
     const a = this.pictures.get(left), b = this.pictures.get(right ?? left), { canvas, device } = this;
     const at = right === null ? canvas.width : divider;
@@ -219,7 +204,6 @@ export class WebGPURenderer {
     device.queue.submit([encoder.finish()]);
   }
 
-  /// Colour and transmittance of a picture: four numbers a pixel. Rejects where there is none.
   async read(name) {
     const picture = this.pictures.get(name);
     if (!picture || this.isLost) throw new Error('There is no picture: the graphics device was lost since.');
@@ -234,7 +218,5 @@ export class WebGPURenderer {
     return values;
   }
 
-  dispose() {
-    this.device.destroy();
-  }
+  dispose() { this.device.destroy(); }
 }

@@ -10,11 +10,15 @@ import { SORT_BITS, SORT_BLOCK, SORT_COUNT, SORT_SCAN, SORT_SCATTER } from './so
 
 const MOST_WORKGROUPS = 65535;  // along one direction
 const SPLAT_BYTES = 48;
+export const WORKING_BYTES = SPLAT_BYTES + 5 * 4;  // of a Gaussian beside the scene: splat, depths, order, tiles
 const FIRST_ROOM = 65536;       // pairs, until it is known how many there are
 // Byte offsets of the arguments of indirect dispatches, which COUNT_VISIBLE and SCAN_BLOCKS write.
 const VISIBLE_SORT = 0, VISIBLE_EMIT = 16, PAIRS_SORT = 32;
 
 export const STAGES = ['project', 'sort', 'bin', 'sort tiles', 'blend'];  // of a picture, in this order
+
+/// A dispatch of `size` workgroups. `key` names the shader, of which `code` returns the text.
+const step = (stage, key, code, buffers, size) => ({ stage, key, code, buffers, size });
 
 /// Bytes of the largest binding that a scene needs.
 export const largestBinding = meta => meta.count * Math.max(SPLAT_BYTES, ...sceneBytes(meta));
@@ -107,9 +111,7 @@ export class Passes {
   }
 
   /// Pairs that a binding can have.
-  get mostPairs() {
-    return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4);
-  }
+  get mostPairs() { return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4); }
 
   /// Makes room for so many pairs, or as many as a binding can have, and forgets those that there were.
   reserve(room) {
@@ -121,57 +123,42 @@ export class Passes {
     this.pipelines.groups.clear();
   }
 
-  indirect(offset) {
-    return { indirect: this.arguments, offset };
-  }
+  indirect(offset) { return { indirect: this.arguments, offset }; }
 
-  /// Steps of a stable sort by `bits`. `source` is the place of their number in counts. [keys, values] are pairs of
-  /// buffers; the result is in the first ones.
+  /// Steps of a stable sort of two pairs of buffers into the first ones. `source` is where counts has their number.
   *sort(stage, keys, values, bits, source, offset, drops) {
     for (let shift = 0; shift < bits; shift += SORT_BITS) {
       const first = drops && shift === 0, uniform = this.constant(shift, first ? 0 : source, first ? 1 : 0, 0);
       const size = first ? [Math.ceil(this.count / SORT_BLOCK)] : this.indirect(offset);
       const { counts, histogram, totals } = this;
-      yield { stage, key: 'sort count', code: () => SORT_COUNT, buffers: [uniform, counts, keys[0], histogram], size };
-      yield { stage, key: 'sort scan', code: () => SORT_SCAN, buffers: [uniform, counts, histogram, totals],
-        size: [2 ** SORT_BITS] };
-      yield { stage, key: 'sort scatter', code: () => SORT_SCATTER,
-        buffers: [uniform, counts, keys[0], values[0], keys[1], values[1], histogram, totals], size };
+      yield step(stage, 'sort count', () => SORT_COUNT, [uniform, counts, keys[0], histogram], size);
+      yield step(stage, 'sort scan', () => SORT_SCAN, [uniform, counts, histogram, totals], [2 ** SORT_BITS]);
+      const buffers = [uniform, counts, keys[0], values[0], keys[1], values[1], histogram, totals];
+      yield step(stage, 'sort scatter', () => SORT_SCATTER, buffers, size);
       keys.reverse();
       values.reverse();
-      if (first) {
-        yield { stage, key: 'count visible', code: () => COUNT_VISIBLE, buffers: [totals, counts, this.arguments],
-          size: [1] };
-      }
+      if (first) yield step(stage, 'count visible', () => COUNT_VISIBLE, [totals, counts, this.arguments], [1]);
     }
   }
 
-  /// The steps that fill the lists of a picture with this many columns and rows of tiles, and then
-  /// `blended(first row, rows)`, a step that draws some of its rows.
+  /// The steps that fill the lists of a picture of [columns, rows] of tiles, and a function that makes one that blends.
   steps(footprint, [columns, rows], width, ranges, picture) {
     const { counts, tiles, blocks, splats, frame } = this, { kind } = footprint;
     const depths = [...this.depths], order = [...this.order], pairKeys = [...this.pairKeys], pairs = [...this.pairs];
     const groups = Math.ceil(this.count / WORKGROUP), across = Math.min(groups, MOST_WORKGROUPS);
     const steps = [
-      { stage: 'project', key: `project ${kind}`, code: () => project(kind, this.meta),
-        buffers: [frame, this.geometry, this.harmonics, splats, depths[0], tiles],
-        size: [across, Math.ceil(groups / across)] },
+      step('project', `project ${kind}`, () => project(kind, this.meta),
+        [frame, this.geometry, this.harmonics, splats, depths[0], tiles], [across, Math.ceil(groups / across)]),
       ...this.sort('sort', depths, order, 32, 1, VISIBLE_SORT, true),
-      { stage: 'bin', key: 'scan reduce', code: () => SCAN_REDUCE, buffers: [counts, order[0], tiles, blocks],
-        size: this.indirect(VISIBLE_EMIT) },
-      { stage: 'bin', key: 'scan blocks', code: () => SCAN_BLOCKS, buffers: [frame, counts, blocks, this.arguments],
-        size: [1] },
-      { stage: 'bin', key: `emit ${kind}`, code: () => emit(kind),
-        buffers: [frame, counts, order[0], blocks, tiles, splats, pairKeys[0], pairs[0]],
-        size: this.indirect(VISIBLE_EMIT) },
+      step('bin', 'scan reduce', () => SCAN_REDUCE, [counts, order[0], tiles, blocks], this.indirect(VISIBLE_EMIT)),
+      step('bin', 'scan blocks', () => SCAN_BLOCKS, [frame, counts, blocks, this.arguments], [1]),
+      step('bin', `emit ${kind}`, () => emit(kind),
+        [frame, counts, order[0], blocks, tiles, splats, pairKeys[0], pairs[0]], this.indirect(VISIBLE_EMIT)),
       ...this.sort('sort tiles', pairKeys, pairs, Math.ceil(Math.log2(columns * rows + 1)), 2, PAIRS_SORT, false),
-      { stage: 'sort tiles', key: 'ranges', code: () => RANGES, buffers: [counts, pairKeys[0], ranges],
-        size: this.indirect(PAIRS_SORT) },
+      step('sort tiles', 'ranges', () => RANGES, [counts, pairKeys[0], ranges], this.indirect(PAIRS_SORT)),
     ];
-    const blended = (first, number) => ({
-      stage: 'blend', key: `blend ${kind} ${footprint.samples}`, code: () => blend(footprint),
-      buffers: [frame, this.constant(first, 0, 0, 0), ranges, pairs[0], splats, picture], size: [width, number],
-    });
+    const blended = (first, number) => step('blend', `blend ${kind} ${footprint.samples}`, () => blend(footprint),
+      [frame, this.constant(first, 0, 0, 0), ranges, pairs[0], splats, picture], [width, number]);
     return { steps, blended };
   }
 
