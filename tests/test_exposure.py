@@ -14,7 +14,7 @@ from capture_files import circle, draw_picture, write_nerf_synthetic  # noqa: E4
 
 from analytic_rasterizer import cli, training  # noqa: E402
 from analytic_rasterizer.training import files  # noqa: E402
-from analytic_rasterizer.training.exposure import BEGIN, Exposures, best_exposure, corrected  # noqa: E402
+from analytic_rasterizer.training.exposure import RATE, Exposures, best_exposure, corrected  # noqa: E402
 
 
 def test_gradients_of_a_correction():
@@ -53,21 +53,23 @@ def test_the_mean_stays_at_the_identity():
 
 
 def test_a_measured_start():
-    """Gains of stored values by the curve of sRGB, whose mean is 1; photographs that are not known are left alone."""
+    """Gains of stored values, whose mean is 1; photographs that are not known are left alone."""
     stops = torch.tensor([[1.0, 0.0, -1.0], [-0.5, 0.0, 0.5], [math.nan, 0.0, 0.0]], dtype=torch.float64)
     exposures = Exposures(3, torch.device("cpu"))
     exposures.start(torch.full((3, 3), math.nan))
-    assert torch.equal(exposures.matrices, torch.eye(3, 4).expand(3, 3, 4)) and exposures.begin == BEGIN
+    assert torch.equal(exposures.matrices, torch.eye(3, 4).expand(3, 3, 4)) and exposures.rate == RATE
     exposures.start(stops)
-    assert exposures.begin < BEGIN
+    assert exposures.rate < RATE
     assert torch.allclose(exposures.matrices.mean(0), torch.eye(3, 4), atol=1e-6)
     assert torch.equal(exposures.matrices[2], torch.eye(3, 4))
-    # Twice the light of a stored value of the curve's power, between two photographs.
-    stored = [(1.055 * light ** (1 / 2.4) - 0.055) * torch.ones(3, 1, 1) for light in (0.2, 0.2 * 2**1.5)]
-    red = [corrected(torch.full((3, 1, 1), 0.4), exposure)[0] for exposure in exposures.matrices[:2]]
-    assert ((red[0] + 0.055) / (red[1] + 0.055)).item() == pytest.approx(
-        ((stored[1][0] + 0.055) / (stored[0][0] + 0.055)).item(), rel=1e-5
-    )
+    grey = torch.full((3, 1, 1), 0.4)
+    shown = [corrected(grey, exposure).flatten() for exposure in exposures.matrices[:2]]
+    # 1.5 stops more light of red, and of blue the other way round.
+    factor = 2 ** (1.5 / 2.2)
+    assert torch.allclose(shown[0] / shown[1], torch.tensor([factor, 1.0, 1 / factor]))
+    again = Exposures(3, torch.device("cpu"))
+    again.load_state_dict(copy.deepcopy(exposures.state_dict()))
+    assert again.rate == exposures.rate and torch.equal(again.matrices, exposures.matrices)
 
 
 @pytest.fixture

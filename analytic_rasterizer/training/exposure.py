@@ -14,12 +14,13 @@ from torch import Tensor
 
 from .optimizer import TrainingAdam
 
-# The share of the training that is over before anything is learned: the corrections of a scene without shape would hide
-# its errors. Where the start is measured they may begin earlier.
-BEGIN, BEGIN_MEASURED = 0.3, 0.1
-RATE, RATE_END = 3e-3, 3e-4  # learning rates then and at the end, exponential in between
-# Of sRGB: stored values are nearly (1 + OFFSET) light^(1 / POWER) - OFFSET.
-POWER, OFFSET = 2.4, 0.055
+# Until so much of the training is over nothing is learned: corrections of a scene that has no shape yet would hide its
+# errors. Even later they may take for exposure what a photograph shows from its direction. So what was measured is
+# changed more slowly than what is unknown.
+BEGIN = 0.3
+RATE, RATE_MEASURED = 3e-3, 1e-3  # learning rates when it begins; they fall exponentially
+RATE_END = 0.1  # of them, at the end
+GAMMA = 2.2  # stored values are nearly light^(1 / GAMMA), and black stays black
 
 
 class Exposures:
@@ -27,14 +28,14 @@ class Exposures:
 
     Attributes:
         matrices: (V, 3, 4) float32, (A | b) of each.
-        begin: The share of the training after which they are learned.
+        rate: The learning rate when learning begins.
     """
 
     def __init__(self, count: int, device: torch.device):
         self.identity = torch.eye(3, 4, dtype=torch.float32, device=device)
         self.matrices = self.identity.repeat(count, 1, 1)
         self.optimizer = TrainingAdam([self.matrices])
-        self.begin = BEGIN
+        self.rate = RATE
 
     def start(self, stops: Tensor) -> None:
         """Starts from what was measured.
@@ -46,18 +47,16 @@ class Exposures:
         known = stops.isfinite().all(1)
         if not known.any():
             return
-        gains = 2 ** (stops[known] / POWER)
-        gains = gains / gains.mean(0)
-        matrices = torch.cat([torch.diag_embed(gains), OFFSET * (gains - 1)[:, :, None]], 2)
-        self.matrices[known.to(self.matrices.device)] = matrices.to(self.matrices)
-        self.begin = BEGIN_MEASURED
+        gains = 2 ** (stops[known] / GAMMA)
+        gains = torch.diag_embed((gains / gains.mean(0)).to(self.matrices))
+        self.matrices[known.to(gains.device), :, :3] = gains
+        self.rate = RATE_MEASURED
 
     def update(self, gradients: dict[int, Tensor], share: float) -> None:
         """Takes a step with gradients (3, 4) of some photographs, when `share` of the training is over."""
-        if share < self.begin:
+        if share < BEGIN:
             return
-        learned = min((share - self.begin) / (1 - self.begin), 1.0)
-        self.optimizer.param_groups[0]["lr"] = RATE * (RATE_END / RATE) ** learned
+        self.optimizer.param_groups[0]["lr"] = self.rate * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
         grad = torch.zeros_like(self.matrices)
         rows = torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
         for view, gradient in gradients.items():
@@ -69,11 +68,11 @@ class Exposures:
         self.matrices += self.identity - self.matrices.mean(0)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"matrices": self.matrices, "begin": self.begin, "optimizer": self.optimizer.state_dict()}
+        return {"matrices": self.matrices, "rate": self.rate, "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.matrices.copy_(state["matrices"].to(self.matrices))
-        self.begin = state.get("begin", BEGIN)  # older files have none
+        self.rate = state.get("rate", RATE)  # older files have none
         self.optimizer.load_state_dict(state["optimizer"])
 
 
