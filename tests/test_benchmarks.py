@@ -666,6 +666,17 @@ def test_timeline(small_scene, monkeypatch, capsys):
     assert timeline.SLEEPER not in printed
 
 
+def runner(benchmark, monkeypatch, capsys):
+    """A function that runs the program with arguments, and returns what it printed."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", [f"{benchmark.__name__}.py", *map(str, arguments)])
+        benchmark.main()
+        return capsys.readouterr().out
+
+    return run
+
+
 def test_viewer_gpu(small_scene, monkeypatch, capsys):
     """The page's shaders under OpenGL draw what the rasterizer does, also from a prepared file; other pictures are
     noticed."""
@@ -678,11 +689,7 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["viewer_gpu.py", *map(str, arguments)])
-        benchmark.main()
-        return capsys.readouterr().out
-
+    run = runner(benchmark, monkeypatch, capsys)
     shaders, job, written = (small_scene / name for name in ("shaders.json", "job.npz", "out.json"))
     given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
     run("--write-shaders", shaders)
@@ -722,11 +729,7 @@ def test_viewer_webgpu(small_scene, monkeypatch, capsys):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["viewer_webgpu.py", *map(str, arguments)])
-        benchmark.main()
-        return capsys.readouterr().out
-
+    run = runner(benchmark, monkeypatch, capsys)
     plan, job, written = (small_scene / name for name in ("plan.json", "job.npz", "out.json"))
     scene = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
     names = ["analytic", "moment:samples=4", "mip:variance=0.3"]

@@ -73,14 +73,7 @@ def load_capture(
         OSError: A file that cannot be read.
         ValueError: test_every is negative or 1; no such `lens`, `missing`, `masks` or `alpha`.
     """
-    if test_every < 0 or test_every == 1:
-        raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
-    for name, value in {"lens": lens, "missing": missing, "masks": masks, "alpha": alpha}.items():
-        if value not in CHOICES[name]:
-            raise ValueError(f"{name} must be one of {', '.join(CHOICES[name])}, got {value}")
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise io.SceneError(f"{folder}: no such folder")
+    folder = _checked(folder, test_every, lens=lens, missing=missing, masks=masks, alpha=alpha)
     capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras, missing))
     check_capture(folder, capture)
     if capture.ignored_masks and masks == "auto":
@@ -133,13 +126,24 @@ def load_photographs(
 
     Arguments, and what is raised, as there.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise io.SceneError(f"{folder}: no such folder")
+    folder = _checked(folder, test_every, lens=lens, missing=missing, masks=masks, alpha=alpha)
     capture = read_cameras(folder, images, test_every, cameras, missing, with_points=False)
     check_capture(folder, capture)
     capture = _with_masks(capture, masks, alpha)
     return _undistorted(capture) if lens == "undistort" else capture
+
+
+def _checked(folder, test_every: int, **choices: str) -> Path:
+    """The folder, where this and other arguments of `load_capture` are right. Raises as it says."""
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
+    for name, value in choices.items():
+        if value not in CHOICES[name]:
+            raise ValueError(f"{name} must be one of {', '.join(CHOICES[name])}, got {value}")
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise io.SceneError(f"{folder}: no such folder")
+    return folder
 
 
 def read_cameras(

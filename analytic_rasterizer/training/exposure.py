@@ -2,7 +2,7 @@
 
 Of a rendered colour c it makes A c + b, with A 3x3 and b (3,), as the program of 3DGS of 2024 does. What is learned is
 what a photograph has beyond all of them together: the mean over the photographs is kept at the identity. Photographs of
-the test have no correction; `corrected_psnr` asks how good a picture would be with the best one.
+the test have no correction; `best_exposure` finds what would bring a picture nearest to its photograph.
 """
 
 from __future__ import annotations

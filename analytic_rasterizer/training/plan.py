@@ -120,9 +120,9 @@ class CapturePlan:
 
     def to_json(self) -> dict[str, Any]:
         """Everything but `stops`, as JSON holds it."""
-        values = asdict(replace(self, stops={}))
+        values = asdict(self) | {"options": self.options}
         del values["stops"]
-        return {**values, "options": self.options}
+        return values
 
 
 class _Survey(NamedTuple):
