@@ -12,30 +12,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .optimizer import TrainingAdam
+from .. import ops  # noqa: F401  (registers the fake kernels)
 
 # Until so much of the training is over nothing is learned: corrections of a scene that has no shape yet would hide its
-# errors. Even later they may take for exposure what a photograph shows from its direction. So what was measured is
-# changed more slowly than what is unknown.
-BEGIN = 0.3
-RATE, RATE_MEASURED = 3e-3, 1e-3  # learning rates when it begins; they fall exponentially
-RATE_END = 0.1  # of them, at the end
+# errors. docs/internals/training.md has what was tried.
+BEGIN = 0.1
+RATE = 3e-3  # learning rate when it begins; it falls exponentially
+RATE_END = 0.1  # of it, at the end
+BETAS, EPS = (0.9, 0.999), 1e-8
 GAMMA = 2.2  # stored values are nearly light^(1 / GAMMA), and black stays black
+
+_adam = torch.ops.analytic_rasterizer.adam_.default
 
 
 class Exposures:
-    """The corrections of V photographs, and their optimizer.
+    """The corrections of V photographs, and their optimizer: Adam, with one count of steps for all.
 
     Attributes:
         matrices: (V, 3, 4) float32, (A | b) of each.
-        rate: The learning rate when learning begins.
     """
 
     def __init__(self, count: int, device: torch.device):
-        self.identity = torch.eye(3, 4, dtype=torch.float32, device=device)
-        self.matrices = self.identity.repeat(count, 1, 1)
-        self.optimizer = TrainingAdam([self.matrices])
-        self.rate = RATE
+        self.matrices = torch.eye(3, 4, dtype=torch.float32, device=device).repeat(count, 1, 1)
+        self.moments = [torch.zeros_like(self.matrices) for _ in BETAS]
+        self.steps = 0
 
     def start(self, stops: Tensor) -> None:
         """Starts from what was measured.
@@ -50,53 +50,33 @@ class Exposures:
         gains = 2 ** (stops[known] / GAMMA)
         gains = torch.diag_embed((gains / gains.mean(0)).to(self.matrices))
         self.matrices[known.to(gains.device), :, :3] = gains
-        self.rate = RATE_MEASURED
 
     def update(self, gradients: dict[int, Tensor], share: float) -> None:
         """Takes a step with gradients (3, 4) of some photographs, when `share` of the training is over."""
         if share < BEGIN:
             return
-        self.optimizer.param_groups[0]["lr"] = self.rate * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
-        grad = torch.zeros_like(self.matrices)
-        rows = torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
+        rate = RATE * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
         for view, gradient in gradients.items():
-            grad[view] += gradient
-            rows[view] = True
-        self.matrices.grad = grad
-        self.optimizer.update(rows)
-        self.matrices.grad = None
-        self.matrices += self.identity - self.matrices.mean(0)
+            matrix, moments = self.matrices[view], [moment[view] for moment in self.moments]
+            before = matrix.clone()
+            self.steps += 1
+            _adam([matrix], [gradient], *([m] for m in moments), [rate], [self.steps], *BETAS, EPS)
+            # So the mean stays where it was.
+            self.matrices.add_(before.sub_(matrix), alpha=1 / len(self.matrices))
 
     def state_dict(self) -> dict[str, Any]:
-        return {"matrices": self.matrices, "rate": self.rate, "optimizer": self.optimizer.state_dict()}
+        return {"matrices": self.matrices, "moments": self.moments, "steps": self.steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.matrices.copy_(state["matrices"].to(self.matrices))
-        self.rate = state.get("rate", RATE)  # older files have none
-        self.optimizer.load_state_dict(state["optimizer"])
-
-
-class _Corrected(torch.autograd.Function):
-    """By the formulas of csrc/torch/picture.cpp, for the same bits."""
-
-    @staticmethod
-    def forward(ctx, image: Tensor, exposure: Tensor) -> Tensor:
-        ctx.save_for_backward(image, exposure)
-        matrix = exposure[:, :3].reshape(3, 3, 1, 1)
-        return matrix.mul(image[None]).sum(1) + exposure[:, 3].reshape(3, 1, 1)
-
-    @staticmethod
-    def backward(ctx, dL_dcorrected: Tensor) -> tuple[Tensor, Tensor]:
-        image, exposure = ctx.saved_tensors
-        matrix = exposure[:, :3].t().reshape(3, 3, 1, 1)
-        dL_dimage = matrix.mul(dL_dcorrected[None]).sum(1)
-        of_matrix = dL_dcorrected[:, None].mul(image[None]).sum((2, 3))
-        return dL_dimage, torch.cat([of_matrix, dL_dcorrected.sum((1, 2))[:, None]], 1)
+        self.matrices.copy_(state["matrices"])
+        for own, moment in zip(self.moments, state["moments"]):
+            own.copy_(moment)
+        self.steps = state["steps"]
 
 
 def corrected(image: Tensor, exposure: Tensor | None) -> Tensor:
     """A rendered picture (3, H, W) as a photograph with this exposure (3, 4) would have it."""
-    return image if exposure is None else _Corrected.apply(image, exposure)
+    return image if exposure is None else torch.ops.analytic_rasterizer.correct_colors(image, exposure)
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ from torch import Tensor
 from ..distributed import OwnSplats
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
-from ..losses import counted, l1_ssim
+from ..losses import l1_ssim
 from ..optim import MOMENTS
 from .extent import extent_of
 from .model import render_together
@@ -106,7 +106,7 @@ class ShardedTrainer(Trainer):
             truth = self.pictures.target(picture.scale, picture.view, picture.background)
             mask = self.pictures.mask(picture.scale, picture.view)
             loss = loss + l1_ssim(rendering.image, truth, options.ssim_weight, mask) / len(shown)
-            self.last = counted(rendering.image.detach(), truth, mask)
+            self._last = rendering.image.detach(), truth, mask
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
             loss = loss + opacity_weight * gaussians["opacities"].sum() / batch.count

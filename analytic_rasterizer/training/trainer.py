@@ -83,7 +83,6 @@ class Trainer:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
-        last: Picture and target (`Pictures.target`) of the last step, both black where nothing counts.
         dropped: Gaussians that were taken away because a number of theirs had left float32.
         warnings: Sentences for the user; who has told them empties the list.
     """
@@ -121,7 +120,7 @@ class Trainer:
         self.filter_3d: Tensor | None = None
         self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
         self.losses: list[Tensor] = []
-        self.last: tuple[Tensor, Tensor] | None = None
+        self._last: tuple[Tensor, Tensor, Tensor | None] | None = None  # picture, target and mask of the last step
         self.dropped, self.warnings = 0, []
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
         self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
@@ -138,6 +137,11 @@ class Trainer:
     def count(self) -> int:
         """How many Gaussians there are, of all ranks."""
         return len(self.gaussians.means)
+
+    @property
+    def last(self) -> tuple[Tensor, Tensor] | None:
+        """Picture and target (`Pictures.target`) of the last step, both black where nothing counts."""
+        return None if self._last is None else counted(*self._last)
 
     def step(self) -> None:
         """Takes one step of the optimizer.
@@ -294,7 +298,7 @@ class Trainer:
             density.observe_gradients(gradients[len(gaussians)], radii)
         if self.exposures is not None:
             self.exposures.update({shown.view: gradients[-1]}, self.progress.share)
-        self.last = counted(corrected(image, exposure), truth, mask)
+        self._last = image, truth, mask
         return loss, radii > 0 if self.options.sparse_adam else None
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
@@ -320,7 +324,7 @@ class Trainer:
                 image = corrected(image, exposures.setdefault(view, leaf_of_view))
             losses.append(l1_ssim(image, truth, options.ssim_weight, mask))
             seen.append((leaf, radii))
-            self.last = counted(image.detach(), truth, mask)
+            self._last = image.detach(), truth, mask
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
@@ -415,7 +419,7 @@ class Trainer:
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
         if self.exposures is not None:
             self.exposures.load_state_dict(state["exposures"])
-        self.losses, self.last = [], None
+        self.losses, self._last = [], None
         # Checkpoints of earlier versions have neither.
         self.extent = self.density.extent = state.get("extent", self.extent)
         self.dropped = state.get("dropped", 0)

@@ -1,9 +1,10 @@
 // The loops of a training step besides rendering, in float and double, for csrc/torch/training_cpu.cpp: ssim.cpp,
-// activations.cpp and adam.cpp. Compiled once, for the baseline. Bits do not depend on `threads`.
+// activations.cpp, adam.cpp and color_correction.cpp. Compiled once, for the baseline. Bits do not depend on `threads`.
 #pragma once
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/color_correction.h"
 #include "core/density.h"
 #include "core/ssim.h"
 
@@ -14,6 +15,9 @@ template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Targ
 
 template <typename T> void activate(const ActivateParams<T>& p, int threads);
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threads);
+
+template <typename T> void correct_colors(const CorrectParams<T>& p, int threads);
+template <typename T> void correct_colors_vjp(const CorrectVjpParams<T>& p, int threads);
 
 template <typename T> void observe(const ObserveParams<T>& p, int threads);
 

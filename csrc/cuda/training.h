@@ -1,12 +1,13 @@
-// What torch/training_cuda.cpp calls for a training step besides rendering: ssim.cu, activations.cu, adam.cu. Pointers
-// are views of device memory. Functions enqueue kernels on a stream, and do not wait. Bits do not depend on the order
-// of blocks. T: float or double.
+// What torch/training_cuda.cpp calls for a training step besides rendering: ssim.cu, activations.cu, adam.cu,
+// color_correction.cu. Pointers are views of device memory. Functions enqueue kernels on a stream, and do not wait.
+// Bits do not depend on the order of blocks. T: float or double.
 #pragma once
 
 #include <cuda_runtime_api.h>
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/color_correction.h"
 #include "core/density.h"
 #include "core/ssim.h"
 
@@ -21,6 +22,12 @@ template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Targ
 
 template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream);
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream);
+
+/// Fewer than 2^31 for the largest image.
+int64_t correct_blocks(int64_t pixels);
+template <typename T> void correct_colors(const CorrectParams<T>& p, cudaStream_t stream);
+/// block_sums: [correct_blocks, kCorrection], scratch for dL_dmatrix.
+template <typename T> void correct_colors_vjp(const CorrectVjpParams<T>& p, T* block_sums, cudaStream_t stream);
 
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream);
 

@@ -188,6 +188,7 @@ inline constexpr int kSsimThreads = 256, kSsimColumns = 32;
 template <typename T> inline constexpr int kSsimRun = sizeof(T) == 4 ? 4 : 1;
 /// A thread loads kAdamBytes of each array at once.
 inline constexpr int kAdamThreads = 256, kAdamBytes = 16;
+inline constexpr int kCorrectThreads = 256, kCorrectPixels = 8;
 inline constexpr int kActivateThreads = 256, kWeightThreads = 128;
 
 }  // namespace ar::cuda

@@ -226,6 +226,17 @@ struct ActivateArguments {
   }
 };
 
+/// See core/color_correction.h.
+struct CorrectArguments {
+  Tensor image;   ///< (3, H, W).
+  Tensor matrix;  ///< (3, 4).
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("image", image);
+    visit("matrix", matrix);
+  }
+};
+
 struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   Tensor means, log_scales, quats, logit_opacities, shs;
   int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.

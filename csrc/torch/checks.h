@@ -22,6 +22,7 @@ void check(ActivateArguments& a);
 void check(ObserveArguments& a);
 /// What the ops inside would find late, or by another name.
 void check(PictureArguments& a);
+void check(CorrectArguments& a);
 void check(AdamArguments& a);
 
 /// Not yet checked.

@@ -82,6 +82,8 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<L1SsimArguments>, l1_ssim_vjp>{}, "l1_ssim_vjp", gradients);
   visit(Op<ActivateArguments, activate>{}, "activate", "Tensor scales, Tensor rotations, Tensor opacities");
   visit(Op<VjpArguments<ActivateArguments>, activate_vjp>{}, "activate_vjp", gradients);
+  visit(Op<CorrectArguments, correct_colors>{}, "correct_colors", "Tensor corrected");
+  visit(Op<VjpArguments<CorrectArguments>, correct_colors_vjp>{}, "correct_colors_vjp", gradients);
   visit(Op<PictureArguments, picture_gradients>{}, "picture_gradients",
         "Tensor loss, Tensor image, Tensor radii, Tensor[] gradients");
   visit(Op<ObserveArguments, observe>{}, "observe_", "");

@@ -57,8 +57,12 @@ Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
 
-/// loss (), image (3, H, W), radii (P,) int32, gradients: of means, log_scales, quats, logit_opacities, shs and, with
-/// mean_columns, means2D.
+/// corrected (3, H, W).
+Results correct_colors(CorrectArguments a);
+Results correct_colors_vjp(VjpArguments<CorrectArguments> a);
+
+/// loss (), image (3, H, W), corrected; radii (P,) int32; gradients: of means, log_scales, quats, logit_opacities, shs,
+/// with mean_columns means2D, with an exposure its matrix.
 Results picture_gradients(PictureArguments a);
 
 /// Writes gradient_sums, views.

@@ -1,8 +1,6 @@
 // The op picture_gradients: activations, rendering and loss of a training's picture, and the gradients of the
 // parameters. It calls the ops that autograd would call, in the same order and with the same bits, and saves the host
 // the cost of autograd.
-#include <ATen/ops/cat.h>
-
 #include "torch/checks.h"
 #include "torch/ops.h"
 
@@ -28,21 +26,6 @@ RasterizeArguments scene_of(const PictureArguments& a, const Results& activated)
   return scene;
 }
 
-/// The three by three of an exposure, or its transpose, to be multiplied by images of three channels.
-Tensor matrix_of(const Tensor& exposure, bool transposed) {
-  const Tensor matrix = exposure.slice(1, 0, 3);
-  return (transposed ? matrix.t() : matrix).reshape({3, 3, 1, 1});
-}
-/// As `_Corrected` in training/exposure.py, whose bits these are.
-Tensor corrected(const Tensor& image, const Tensor& exposure) {
-  const Tensor offset = exposure.select(1, 3).reshape({3, 1, 1});
-  return matrix_of(exposure, false).mul(image.unsqueeze(0)).sum(at::IntArrayRef({1})).add(offset);
-}
-Tensor exposure_grad(const Tensor& image, const Tensor& dL_dcorrected) {
-  const Tensor of_matrix = dL_dcorrected.unsqueeze(1).mul(image.unsqueeze(0)).sum(at::IntArrayRef({2, 3}));
-  return at::cat({of_matrix, dL_dcorrected.sum(at::IntArrayRef({1, 2})).unsqueeze(1)}, 1);
-}
-
 }  // namespace
 
 Results picture_gradients(PictureArguments a) {
@@ -52,7 +35,8 @@ Results picture_gradients(PictureArguments a) {
   const Results rendered = rasterize(scene);
   L1SsimArguments comparison;
   const Tensor image = rendered[0].toTensor();
-  comparison.image = a.exposure ? corrected(image, *a.exposure) : image;
+  const Tensor shown = a.exposure ? correct_colors({image, *a.exposure})[0].toTensor() : image;
+  comparison.image = shown;
   comparison.target = a.target;
   if (a.mask) {  // as `counted` in losses.py
     const bool levels = a.target.scalar_type() == at::kByte;
@@ -70,8 +54,10 @@ Results picture_gradients(PictureArguments a) {
   if (a.mask) dL_dimage = dL_dimage.mul(*a.mask);
   Tensor dL_dexposure;
   if (a.exposure) {
-    dL_dexposure = exposure_grad(image, dL_dimage);
-    dL_dimage = matrix_of(*a.exposure, true).mul(dL_dimage.unsqueeze(0)).sum(at::IntArrayRef({1}));
+    const std::vector<Tensor> of_correction =
+        correct_colors_vjp({{dL_dimage}, {image, *a.exposure}, {}, {true, true}})[0].toTensorVector();
+    dL_dimage = of_correction[0];
+    dL_dexposure = of_correction[1];
   }
   std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
   for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
@@ -83,7 +69,7 @@ Results picture_gradients(PictureArguments a) {
   std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
   if (needs[1]) gradients.push_back(of_scene[1]);
   if (a.exposure) gradients.push_back(dL_dexposure);
-  return {compared[0], image, rendered[2], gradients};
+  return {compared[0], shown, rendered[2], gradients};
 }
 
 }  // namespace ar::ops

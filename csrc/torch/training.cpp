@@ -1,5 +1,5 @@
-// The ops of a training step besides rendering: loss, activations, density control (observe_) and optimiser, with
-// adjoints. They check, allocate, and call the device's TrainingKernels (training.h).
+// The ops of a training step besides rendering: loss, activations, colour correction, density control (observe_) and
+// optimiser, with adjoints. They check, allocate, and call the device's TrainingKernels (training.h).
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -105,6 +105,29 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   t.dL_dlogit_opacities = room(2, a.logit_opacities);
   training_kernels(a.log_scales).activate_vjp(t);
   return {std::vector<Tensor>{t.dL_dlog_scales, t.dL_dquats, t.dL_dlogit_opacities}};
+}
+
+Results correct_colors(CorrectArguments a) {
+  check(a);
+  CorrectTensors t = {a.image, a.matrix};
+  t.corrected = at::empty(a.image.sizes(), a.image.options());
+  training_kernels(a.image).correct_colors(t);
+  return {t.corrected};
+}
+
+Results correct_colors_vjp(VjpArguments<CorrectArguments> arguments) {
+  CorrectArguments& a = arguments.of_op;
+  check(a);
+  check_needs(arguments.needs, 2);
+  const auto room = [&](size_t argument, const Tensor& like) {
+    return at::empty(arguments.needs[argument] ? like.sizes() : at::IntArrayRef({0}), like.options());
+  };
+  CorrectTensors t = {a.image, a.matrix};
+  t.dL_dcorrected = only_gradient_of(arguments.dL_doutputs, "corrected", a.image, a.image.sizes());
+  t.dL_dimage = room(0, a.image);
+  t.dL_dmatrix = room(1, a.matrix);
+  training_kernels(a.image).correct_colors_vjp(t);
+  return {std::vector<Tensor>{t.dL_dimage, t.dL_dmatrix}};
 }
 
 Results observe(ObserveArguments a) {

@@ -7,6 +7,7 @@
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/color_correction.h"
 #include "core/density.h"
 #include "core/ssim.h"
 #include "torch/arguments.h"
@@ -32,6 +33,13 @@ struct ActivateTensors {
   Tensor dL_dlog_scales, dL_dquats, dL_dlogit_opacities;
 };
 
+struct CorrectTensors {
+  Tensor image, matrix;
+  Tensor corrected;
+  Tensor dL_dcorrected;
+  Tensor dL_dimage, dL_dmatrix;
+};
+
 /// They run on the device's current stream.
 class TrainingKernels {
  public:
@@ -40,6 +48,8 @@ class TrainingKernels {
   virtual void ssim_vjp(const SsimTensors& t) const = 0;
   virtual void activate(const ActivateTensors& t) const = 0;
   virtual void activate_vjp(const ActivateTensors& t) const = 0;
+  virtual void correct_colors(const CorrectTensors& t) const = 0;
+  virtual void correct_colors_vjp(const CorrectTensors& t) const = 0;
   virtual void observe(const ObserveArguments& a) const = 0;
   virtual void adam(const AdamArguments& a) const = 0;
 };
@@ -122,6 +132,26 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   p.dL_dlog_scales = pointer<Vec3<T>>(t.dL_dlog_scales);
   p.dL_dquats = pointer<Vec4<T>>(t.dL_dquats);
   p.dL_dlogit_opacities = pointer<T>(t.dL_dlogit_opacities);
+  return p;
+}
+
+template <typename T> CorrectParams<T> correct_params(const CorrectTensors& t) {
+  CorrectParams<T> p = {};
+  p.pixels = t.image.numel() / 3;
+  p.image = const_pointer<T>(t.image);
+  p.matrix = const_pointer<T>(t.matrix);
+  p.corrected = pointer<T>(t.corrected);
+  return p;
+}
+
+template <typename T> CorrectVjpParams<T> correct_vjp_params(const CorrectTensors& t) {
+  CorrectVjpParams<T> p = {};
+  p.pixels = t.image.numel() / 3;
+  p.image = const_pointer<T>(t.image);
+  p.matrix = const_pointer<T>(t.matrix);
+  p.dL_dcorrected = const_pointer<T>(t.dL_dcorrected);
+  p.dL_dimage = pointer<T>(t.dL_dimage);
+  p.dL_dmatrix = pointer<T>(t.dL_dmatrix);
   return p;
 }
 

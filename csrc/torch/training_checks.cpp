@@ -157,6 +157,18 @@ void check(ObserveArguments& a) {
                     "gradient_sums and views must not share memory with each other or with gradients and radii");
 }
 
+void check(CorrectArguments& a) {
+  check_floating(a.image, "image");
+  check_shape(a.image.dim() == 3 && a.image.size(0) == 3, a.image, "image", "(3, H, W)");
+  TORCH_CHECK_VALUE(a.image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(a.image));
+  check_image_size(a.image.size(1), a.image.size(2));
+  a.image = a.image.contiguous();
+  const Like like{a.image, "image"};
+  like.check_type(a.matrix, "matrix");
+  check_shape(a.matrix.sizes() == at::IntArrayRef({3, 4}), a.matrix, "matrix", "(3, 4)");
+  a.matrix = a.matrix.contiguous();
+}
+
 void check(PictureArguments& a) {
   TORCH_CHECK_VALUE(a.mean_columns == 0 || a.mean_columns == 3 || a.mean_columns == 4,
                     "mean_columns must be 0, 3 or 4, got ", a.mean_columns);

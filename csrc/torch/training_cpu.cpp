@@ -27,6 +27,15 @@ class CpuTrainingKernels final : public TrainingKernels {
     visit_scalar(t.log_scales,
                  [&](auto scalar) { cpu::activate_vjp(activate_vjp_params<decltype(scalar)>(t), thread_count()); });
   }
+  void correct_colors(const CorrectTensors& t) const override {
+    visit_scalar(t.image,
+                 [&](auto scalar) { cpu::correct_colors(correct_params<decltype(scalar)>(t), thread_count()); });
+  }
+  void correct_colors_vjp(const CorrectTensors& t) const override {
+    visit_scalar(t.image, [&](auto scalar) {
+      cpu::correct_colors_vjp(correct_vjp_params<decltype(scalar)>(t), thread_count());
+    });
+  }
   void observe(const ObserveArguments& a) const override {
     visit_scalar(a.gradient_sums,
                  [&](auto scalar) { cpu::observe(observe_params<decltype(scalar)>(a), thread_count()); });

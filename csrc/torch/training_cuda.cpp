@@ -54,6 +54,21 @@ class CudaTrainingKernels final : public TrainingKernels {
       on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate_vjp(p, stream); });
     });
   }
+  void correct_colors(const CorrectTensors& t) const override {
+    visit_scalar(t.image, [&](auto scalar) {
+      const auto p = correct_params<decltype(scalar)>(t);
+      on_stream(t.image, [&](cudaStream_t stream) { cuda::correct_colors(p, stream); });
+    });
+  }
+  void correct_colors_vjp(const CorrectTensors& t) const override {
+    visit_scalar(t.image, [&](auto scalar) {
+      using T = decltype(scalar);
+      const auto p = correct_vjp_params<T>(t);
+      const int64_t blocks = p.dL_dmatrix ? cuda::correct_blocks(p.pixels) : 0;
+      const Tensor block_sums = at::empty({blocks, kCorrection}, t.image.options());
+      on_stream(t.image, [&](cudaStream_t stream) { cuda::correct_colors_vjp(p, pointer<T>(block_sums), stream); });
+    });
+  }
   void observe(const ObserveArguments& a) const override {
     visit_scalar(a.gradient_sums, [&](auto scalar) {
       const auto p = observe_params<decltype(scalar)>(a);
