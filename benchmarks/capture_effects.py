@@ -1,9 +1,10 @@
-"""Trains on a capture, and on a spoiled copy of it with `--effects auto` and without, and tests on clean photographs.
+"""Trains on a capture, and on spoiled copies of it with `--effects auto` and without, and tests on clean photographs.
 
     python benchmarks/capture_effects.py lego bonsai fox --out effects --device cuda
     python benchmarks/capture_effects.py lego --out effects --device cpu --reduce 4 --iterations 50
 
-Every capture is written twice, as nerfstudio's files, clean and spoiled. Of the spoiled copy, in this order
+Every capture is written three times, as nerfstudio's files: clean, spoiled, and masked, which has only the last two of
+these. So the masked copy says what the masks hide. Of the spoiled copy, in this order
 
 - the *training* photographs have uneven exposure (evenly spread over ±`--stops`) and white balance (red against green
   against blue, ±`--balance` percent), of linear light and clipped at white. Both are such that the mean factor of the
@@ -12,7 +13,7 @@ Every capture is written twice, as nerfstudio's files, clean and spoiled. Of the
 - a rectangle of each (`--masked`, a share of its pixels) is painted over with noise, and has a mask;
 - one camera is thrown far away.
 
-Photographs for the test are the same in both copies: those of the capture, clean, without masks. They would not tell
+Photographs for the test are the same in all copies: those of the capture, clean, without masks. They would not tell
 how good a scene is if their exposure were another one. The table has their PSNR as they are, and after the best affine
 map of the colours of each picture, which forgives a scene with another mean exposure; both with ± over seeds.
 
@@ -45,6 +46,7 @@ from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
 from analytic_rasterizer.training.files import write_json
 
 FAR = 1000  # extents, at which the camera is that is thrown far away
+COPIES = ("clean", "masked", "spoiled")
 GAMMA = 2.2  # of stored values, nearly
 BLUR = 2.0  # px, radius
 
@@ -60,6 +62,7 @@ class Row(NamedTuple):
 ROWS = {
     "clean": Row("clean", "none"),
     "clean, auto": Row("clean", "auto"),
+    "masked, auto": Row("masked", "auto"),
     "spoiled, auto": Row("spoiled", "auto"),
     "spoiled": Row("spoiled", "none"),
     "spoiled, masks ignored": Row("spoiled", "none", "none"),
@@ -140,15 +143,15 @@ def _spread(values: list[float]) -> str:
 
 
 def write_copies(folder: Path, out: Path, args: argparse.Namespace) -> None:
-    """Writes the folders "clean" and "spoiled"."""
+    """Writes the folders of COPIES."""
     capture = load_capture(folder, lens="refuse", masks="none", offset=(0.0, 0.0, 0.0))
     shutil.rmtree(out, ignore_errors=True)
-    for name in ("clean", "spoiled"):
-        write_copy(out / name, capture, args, name == "spoiled")
+    for name in COPIES:
+        write_copy(out / name, capture, args, name)
 
 
-def write_copy(folder: Path, capture: Capture, args: argparse.Namespace, spoiled: bool) -> None:
-    """A copy as nerfstudio's files."""
+def write_copy(folder: Path, capture: Capture, args: argparse.Namespace, copy: str) -> None:
+    """A copy of COPIES as nerfstudio's files."""
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(0)
@@ -166,9 +169,10 @@ def write_copy(folder: Path, capture: Capture, args: argparse.Namespace, spoiled
             picture = shrunk(picture, args.reduce)
             view, name = item.view.resized(*picture.size), f"images/{split}_{place:04d}.png"
             frame = frame_of(view, name)
-            if spoiled and split == "train":
+            if copy == "spoiled" and split == "train":
                 picture = exposed(picture, stops[place])
                 picture = picture.filter(ImageFilter.GaussianBlur(BLUR)) if blurred[place] else picture
+            if copy != "clean" and split == "train":
                 if args.masked > 0:
                     picture, mask = painted(picture, args.masked, random)
                     frame["mask_path"] = name.replace("images", "masks")

@@ -189,6 +189,8 @@ def steps(device: str) -> None:
         leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
         sum(made.sum() for made in activate(*leaves)).backward()
         FusedAdam(leaves).step()
+        matrix = torch.eye(3, 4, **numbers).requires_grad_()
+        torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
         sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
         radii = torch.ones(300, dtype=torch.int32, device=device)
         torch.ops.analytic_rasterizer.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)

@@ -892,7 +892,8 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
     assert [run["row"] for run in runs] == list(effects.ROWS) and all(f" {name} " in table for name in effects.ROWS)
     taken = {run["row"]: run["taken"] for run in runs}
     assert taken["spoiled, auto"] == {"exposure": "affine", "masks": "auto"} and taken["clean, auto"] == {}
-    assert taken["spoiled"] == {} and all(math.isfinite(run["psnr"]) for run in runs)
+    assert taken["masked, auto"] == {"masks": "auto"} and taken["spoiled"] == {}
+    assert all(math.isfinite(run["psnr"]) for run in runs)
     clean, spoiled = (training.load_capture(tmp_path / "out" / "wall" / name) for name in ("clean", "spoiled"))
     assert (len(clean.train), len(spoiled.train), len(spoiled.test)) == (8, 7, 2)
     pixels = {path: np.asarray(image.open(path), dtype=float) for item in (*clean.train, *clean.test, *spoiled.train)

@@ -16,7 +16,6 @@ from analytic_rasterizer import cli, training  # noqa: E402
 from analytic_rasterizer.training import files  # noqa: E402
 from analytic_rasterizer.training.exposure import Exposures, best_exposure, corrected  # noqa: E402
 
-
 OP = torch.ops.analytic_rasterizer.correct_colors
 
 
