@@ -35,7 +35,7 @@ from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, loa
 from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.options import DOWNSAMPLINGS, PRESETS, preset_values
 from analytic_rasterizer.training.schedule import Clock
-from analytic_rasterizer.training.trainer import background_of, starting_gaussians
+from analytic_rasterizer.training.start import background_of, starting_gaussians
 
 LOOK_PERIOD = 100  # steps between looks at loss and clock
 RATES_OF_3DGS = {name: value for name, value in PRESETS["3dgs"].values.items() if name.endswith("_rate")}

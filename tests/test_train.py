@@ -895,7 +895,7 @@ def test_number_of_random_points():
     earlier = TrainingOptions.from_dict({"random_points": 500, "max_gaussians": 300})
     assert earlier.random_points == 500
     with pytest.raises(ValueError, match="random_points must be at most max_gaussians, 300, got 500"):
-        training.trainer.starting_gaussians(earlier, None)
+        training.starting_gaussians(earlier, None)
 
 
 @pytest.mark.parametrize("given", [False, True], ids=["of the capture", "given"])

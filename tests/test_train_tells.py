@@ -236,7 +236,7 @@ def test_times_of_the_preset_are_those_of_3dgs():
 @pytest.mark.parametrize("steps, options", [(600, {}), (7000, {}), (40, {"densify_from": 3, "densify_every": 4})])
 def test_steps_at_which_the_number_may_change(steps, options):
     """Are those at which density control says that it has."""
-    parameters = training.trainer.starting_gaussians(TrainingOptions(random_points=5), None)
+    parameters = training.starting_gaussians(TrainingOptions(random_points=5), None)
     parameters = parameters.map(lambda field: field.requires_grad_())
     optimizer = torch.optim.Adam([{"params": [field]} for field in parameters])
     options = TrainingOptions(iterations=steps, prune_opacity=0.0, **options)
@@ -305,7 +305,7 @@ def test_an_option_without_effect_is_an_error(scene, tmp_path, capsys, options, 
 
 
 def test_an_option_without_effect_on_the_start_is_an_error(scene, tmp_path, capsys):
-    io.save_scene(tmp_path / "start.ply", training.trainer.starting_gaussians(TrainingOptions(random_points=9), None))
+    io.save_scene(tmp_path / "start.ply", training.starting_gaussians(TrainingOptions(random_points=9), None))
     points = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
     (tmp_path / "points.ply").write_text(points + "end_header\n0 0 0\n1 0 0\n")
     for start, option in (("start", "initial-opacity"), ("start", "initial-scale"), ("points", "random-points")):

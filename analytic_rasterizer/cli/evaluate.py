@@ -16,8 +16,8 @@ from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
+from ..training.start import background_of
 from ..training.store import processes_here
-from ..training.trainer import background_of
 from .arguments import (
     add_machine_options,
     add_scales,

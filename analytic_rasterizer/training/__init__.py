@@ -17,8 +17,9 @@ from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
+from .start import starting_gaussians
 from .store import PictureMemory
-from .trainer import Trainer, starting_gaussians
+from .trainer import Trainer
 
 __all__ = [
     "PRESETS",

@@ -45,9 +45,9 @@ from .pictures import Pictures, load_pictures
 from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .start import capture_arguments, check_source, first_gaussians, of_length, source_of, stored_offset
+from .start import background_of, capture_arguments, check_source, first_gaussians, of_length, source_of, stored_offset
 from .store import PictureMemory, described, processes_here
-from .trainer import Trainer, background_of
+from .trainer import Trainer
 
 if TYPE_CHECKING:
     from ..viewer import LiveViewer

@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from .. import io
 from ..gaussians import Gaussians
 from .captures import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture
 from .extent import seen_distance
 from .health import FAINTEST
-from .options import TrainingOptions
-from .placement import focus_of
-from .trainer import starting_gaussians
+from .model import random_points
+from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
+from .placement import focus_of, points_in_view
 from .unused import check_effect
 
 
@@ -150,3 +151,47 @@ def first_gaussians(
             f"no picture shows any of the {len(found[0])} points of {source}: the cameras must see them"
         )
     return start, None if found is None else len(found[0])
+
+
+def starting_gaussians(
+    options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
+) -> Gaussians:
+    """Gaussians at points, or at random positions where there are none. On the CPU.
+
+    Args:
+        options: Of the training. Of more points than its `max_gaussians`, so many are drawn by its seed; they keep
+            their order.
+        points: Positions and colours, (P, 3) each; None: random.
+        views: In whose pictures random positions are; None: in the cube of NeRF-synthetic scenes.
+
+    Raises:
+        io.SceneError: Fewer than two points.
+        ValueError: More random points than `max_gaussians`.
+    """
+    limit = options.gaussian_limit
+    if points is None:
+        if options.random_points > limit:
+            raise ValueError(f"random_points must be at most max_gaussians, {limit}, got {options.random_points}")
+        if views is None:
+            means, colors = random_points(options.random_points, options.seed)
+        else:
+            means, colors = points_in_view(views, options.random_points, options.seed)
+    else:
+        means, colors = points
+        if len(means) > limit:
+            generator = torch.Generator().manual_seed(options.seed)
+            rows = torch.randperm(len(means), generator=generator, device="cpu")[:limit].sort().values
+            means, colors = means[rows], colors[rows]
+    if len(means) < 2:
+        because = " (max_gaussians)" if limit < 2 else ""
+        raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}{because}")
+    # Distances are those of the positions as they are given, float64 too.
+    colors, first = colors.to(means.dtype), (options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, *first).map(Tensor.float)
+
+
+def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:
+    """The colour of the options, or that of the capture's convention; None for random ones."""
+    if options.background == RANDOM_BACKGROUND:
+        return None
+    return BACKGROUNDS.get(options.background, convention)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import _C, io
+from .. import _C
 from ..arguments import camera_arguments
 from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
@@ -25,11 +25,10 @@ from .captures import WHITE
 from .exposure import Exposures, corrected
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
-from .model import random_points, render
+from .model import render
 from .optimizer import TrainingAdam
-from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
+from .options import TrainingOptions
 from .pictures import Pictures
-from .placement import points_in_view
 from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
@@ -444,47 +443,3 @@ def make_density(
     if options.density == "mcmc":
         return MonteCarloDensity(gaussians, optimizer, chosen, **common)
     return GradientDensity(gaussians, optimizer, extent, chosen, **common)
-
-
-def starting_gaussians(
-    options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
-) -> Gaussians:
-    """Gaussians at points, or at random positions where there are none. On the CPU.
-
-    Args:
-        options: Of the training. Of more points than its `max_gaussians`, so many are drawn by its seed; they keep
-            their order.
-        points: Positions and colours, (P, 3) each; None: random.
-        views: In whose pictures random positions are; None: in the cube of NeRF-synthetic scenes.
-
-    Raises:
-        io.SceneError: Fewer than two points.
-        ValueError: More random points than `max_gaussians`.
-    """
-    limit = options.gaussian_limit
-    if points is None:
-        if options.random_points > limit:
-            raise ValueError(f"random_points must be at most max_gaussians, {limit}, got {options.random_points}")
-        if views is None:
-            means, colors = random_points(options.random_points, options.seed)
-        else:
-            means, colors = points_in_view(views, options.random_points, options.seed)
-    else:
-        means, colors = points
-        if len(means) > limit:
-            generator = torch.Generator().manual_seed(options.seed)
-            rows = torch.randperm(len(means), generator=generator, device="cpu")[:limit].sort().values
-            means, colors = means[rows], colors[rows]
-    if len(means) < 2:
-        because = " (max_gaussians)" if limit < 2 else ""
-        raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}{because}")
-    # Distances are those of the positions as they are given, float64 too.
-    colors, first = colors.to(means.dtype), (options.sh_degree, options.initial_opacity, options.initial_scale)
-    return Gaussians.from_points(means, colors, *first).map(Tensor.float)
-
-
-def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:
-    """The colour of the options, or that of the capture's convention; None for random ones."""
-    if options.background == RANDOM_BACKGROUND:
-        return None
-    return BACKGROUNDS.get(options.background, convention)

@@ -22,7 +22,7 @@ from ..files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_text
 from ..options import TrainingOptions, preset_values
 from ..pictures import load_pictures
 from ..run import Run
-from ..trainer import background_of
+from ..start import background_of
 from .protocols import Row, Table
 from .report import Results, as_dict, markdown
 
