@@ -346,7 +346,7 @@ def test_a_picture_without_gaussians_is_none(orbit, tmp_path):
     """As long as another one has some."""
     run = make_run(orbit, tmp_path, density="none", iterations=100)
     run.trainer.step()
-    run.trainer.last = torch.zeros(3, 32, 32), run.trainer.last[1]
+    run.trainer._last = torch.zeros(3, 32, 32), *run.trainer._last[1:]
     run.trainer.check()
 
 

@@ -54,7 +54,8 @@ else:
     exec(compile(sys.argv[0], "<tutorial>", "exec"), {"__name__": "__main__"})
 """
 AT_THE_BROWSER = """
-import _thread, threading, urllib.request, webbrowser
+import _thread, signal, threading, urllib.request, webbrowser
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 def look(url):
     try:
         with urllib.request.urlopen(url) as answer:
