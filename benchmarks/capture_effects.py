@@ -3,15 +3,16 @@
     python benchmarks/capture_effects.py lego bonsai fox --out effects --device cuda
     python benchmarks/capture_effects.py lego --out effects --device cpu --reduce 4 --iterations 50
 
-Every capture is written three times, as nerfstudio's files: clean, spoiled, and masked, which has only the last two of
-these. So the masked copy says what the masks hide. Of the spoiled copy, in this order
+Every capture is written three times, as nerfstudio's files: clean, masked and spoiled. Of the spoiled copy
 
 - the *training* photographs have uneven exposure (evenly spread over ±`--stops`) and white balance (red against green
-  against blue, ±`--balance` percent), of linear light and clipped at white. Both are such that the mean factor of the
-  stored values is 1, for the colours of the scene are those of the mean photograph;
-- a share of them (`--blurred`) is blurred, none by default;
-- a rectangle of each (`--masked`, a share of its pixels) is painted over with noise, and has a mask;
-- one camera is thrown far away.
+  against blue, ±`--balance` percent), of linear light and clipped at white. The mean factor of the stored values is 1,
+  since the colours of the scene are those of the mean photograph.
+- A share of them (`--blurred`) is blurred, none by default.
+- A rectangle of each (`--masked`, a share of its pixels) is painted over with noise, and has a mask.
+- One camera is thrown far away.
+
+They are made in this order. The masked copy has the rectangles and the camera alone, and so says what masks hide.
 
 Photographs for the test are the same in all copies: those of the capture, clean, without masks. They would not tell
 how good a scene is if their exposure were another one. The table has their PSNR as they are, and after the best affine

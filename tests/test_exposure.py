@@ -102,6 +102,9 @@ def test_a_measured_start():
     # 1.5 stops more light of red, and of blue the other way round.
     factor = 2 ** (1.5 / 2.2)
     assert torch.allclose(shown[0] / shown[1], torch.tensor([factor, 1.0, 1 / factor]))
+    again = Exposures(3, torch.device("cpu"))
+    again.load_state_dict(copy.deepcopy(exposures.state_dict()))
+    assert torch.equal(again.matrices, exposures.matrices)
 
 
 @pytest.fixture

@@ -111,16 +111,16 @@ def check_visible(trainer: Trainer) -> None:
             f"all {count:,} Gaussians are transparent after step {step:,} (opacities below 1/255), so that nothing can "
             f"be learned any more; a lower {' or '.join(map(flag, options))} may help{_about_pictures(trainer)}"
         )
-    if trainer.ranks.world == 1 and trainer.last is not None and not _any_shown(trainer):
+    last = trainer.last if trainer.ranks.world == 1 else None
+    if last is not None and not _any_shown(trainer, last[0]):
         raise RuntimeError(
             f"no picture shows any of the {count:,} Gaussians after step {step:,}, so that nothing can be learned any "
             f"more; a lower {flag('means_rate')} or {flag('scale_rate')} may help"
         )
 
 
-def _any_shown(trainer: Trainer) -> bool:
-    """Whether the last picture is more than background, or another picture would show a Gaussian."""
-    image = trainer.last[0]
+def _any_shown(trainer: Trainer, image: Tensor) -> bool:
+    """Whether the last picture, `image`, is more than background, or another picture would show a Gaussian."""
     if bool((image != image[:, :1, :1]).any()):
         return True
     arguments = trainer.scene().arguments()

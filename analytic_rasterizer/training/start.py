@@ -159,8 +159,8 @@ def starting_gaussians(
     """Gaussians at points, or at random positions where there are none. On the CPU.
 
     Args:
-        options: Of the training. Of more points than its `max_gaussians`, so many are drawn by its seed; they keep
-            their order.
+        options: Of the training. Where there are more points than `max_gaussians`, that many are drawn by the seed,
+            and stay in the order of the points.
         points: Positions and colours, (P, 3) each; None: random.
         views: In whose pictures random positions are; None: in the cube of NeRF-synthetic scenes.
 

@@ -39,6 +39,11 @@ SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, co
   return t;
 }
 
+/// For a gradient of `like`; empty if not wanted.
+Tensor room_for(bool wanted, const Tensor& like) {
+  return at::empty(wanted ? like.sizes() : at::IntArrayRef({0}), like.options());
+}
+
 Results run_ssim_vjp(const SsimTensors& t) {
   training_kernels(t.image).ssim_vjp(t);
   return {std::vector<Tensor>{t.dL_dimage, at::empty({0}, t.image.options())}};
@@ -89,20 +94,16 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   ActivateArguments& a = arguments.of_op;
   check(a);
   check_needs(arguments.needs, 3);
-  const auto options = a.log_scales.options();
   const auto gradient = [&](size_t output, const char* name, const Tensor& of) {
     return gradient_of(arguments.dL_doutputs, output, name, a.log_scales, of.sizes());
-  };
-  const auto room = [&](size_t argument, const Tensor& like) {
-    return arguments.needs[argument] ? at::empty(like.sizes(), options) : at::empty({0}, options);
   };
   ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
   t.dL_dscales = gradient(0, "dL_dscales", a.log_scales);
   t.dL_drotations = gradient(1, "dL_drotations", a.quats);
   t.dL_dopacities = gradient(2, "dL_dopacities", a.logit_opacities);
-  t.dL_dlog_scales = room(0, a.log_scales);
-  t.dL_dquats = room(1, a.quats);
-  t.dL_dlogit_opacities = room(2, a.logit_opacities);
+  t.dL_dlog_scales = room_for(arguments.needs[0], a.log_scales);
+  t.dL_dquats = room_for(arguments.needs[1], a.quats);
+  t.dL_dlogit_opacities = room_for(arguments.needs[2], a.logit_opacities);
   training_kernels(a.log_scales).activate_vjp(t);
   return {std::vector<Tensor>{t.dL_dlog_scales, t.dL_dquats, t.dL_dlogit_opacities}};
 }
@@ -119,13 +120,10 @@ Results correct_colors_vjp(VjpArguments<CorrectArguments> arguments) {
   CorrectArguments& a = arguments.of_op;
   check(a);
   check_needs(arguments.needs, 2);
-  const auto room = [&](size_t argument, const Tensor& like) {
-    return at::empty(arguments.needs[argument] ? like.sizes() : at::IntArrayRef({0}), like.options());
-  };
   CorrectTensors t = {a.image, a.matrix};
   t.dL_dcorrected = only_gradient_of(arguments.dL_doutputs, "corrected", a.image, a.image.sizes());
-  t.dL_dimage = room(0, a.image);
-  t.dL_dmatrix = room(1, a.matrix);
+  t.dL_dimage = room_for(arguments.needs[0], a.image);
+  t.dL_dmatrix = room_for(arguments.needs[1], a.matrix);
   training_kernels(a.image).correct_colors_vjp(t);
   return {std::vector<Tensor>{t.dL_dimage, t.dL_dmatrix}};
 }

@@ -135,20 +135,23 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   return p;
 }
 
-template <typename T> CorrectParams<T> correct_params(const CorrectTensors& t) {
-  CorrectParams<T> p = {};
+/// For correct_colors and its adjoint.
+template <typename T, class Params> void set_correction(Params& p, const CorrectTensors& t) {
   p.pixels = t.image.numel() / 3;
   p.image = const_pointer<T>(t.image);
   p.matrix = const_pointer<T>(t.matrix);
+}
+
+template <typename T> CorrectParams<T> correct_params(const CorrectTensors& t) {
+  CorrectParams<T> p = {};
+  set_correction<T>(p, t);
   p.corrected = pointer<T>(t.corrected);
   return p;
 }
 
 template <typename T> CorrectVjpParams<T> correct_vjp_params(const CorrectTensors& t) {
   CorrectVjpParams<T> p = {};
-  p.pixels = t.image.numel() / 3;
-  p.image = const_pointer<T>(t.image);
-  p.matrix = const_pointer<T>(t.matrix);
+  set_correction<T>(p, t);
   p.dL_dcorrected = const_pointer<T>(t.dL_dcorrected);
   p.dL_dimage = pointer<T>(t.dL_dimage);
   p.dL_dmatrix = pointer<T>(t.dL_dmatrix);
