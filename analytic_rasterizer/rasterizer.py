@@ -9,17 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch.overrides import has_torch_function
 
-from . import (
-    _C,
-    advice,
-    ops,  # noqa: F401  (registers the fake kernels)
-)
+from . import _C, advice
 from .arguments import camera_arguments, gaussian_arguments
 from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import NEAR, Effects, Outputs
+from .ops import Op
 from .outputs import before_background, depths, split_background, summaries
 from .seam import has_seam
 from .settings import GaussianRasterizationSettings
@@ -28,16 +24,13 @@ from .sphere import render_sphere
 NOTHING = Effects()
 """Asks for no output."""
 
-_call = _C.Call("rasterize")
+_op = Op("rasterize")
 
 
 def _rasterize(settings: GaussianRasterizationSettings, **arguments: Any) -> tuple:
-    """The operator. Its quicker way is not known to torch.compile, nor to what overrides functions of torch."""
-    if torch.compiler.is_compiling():
-        return torch.ops.analytic_rasterizer.rasterize(**arguments)
-    quick = not has_torch_function(tuple(arguments.values()))
-    results = (_call if quick else torch.ops.analytic_rasterizer.rasterize)(**arguments)
-    if advice.is_due and settings.footprint is None:
+    """The operator. Advice is no matter of torch.compile."""
+    results = _op(**arguments)
+    if not torch.compiler.is_compiling() and advice.is_due and settings.footprint is None:
         advice.give(settings)
     return results
 

@@ -17,13 +17,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import (
-    _C,
-    ops,  # noqa: F401  (registers the fake kernels)
-)
+from . import _C
 from .arguments import camera_arguments, gaussian_arguments
 from .checks import check_tensors
 from .effects import Effects
+from .ops import Op
 from .outputs import before_background, depths, split_background
 from .seam import turns_of, with_copies
 from .settings import GaussianRasterizationSettings, check_settings
@@ -90,9 +88,7 @@ class Splats:
         if self.cameras == 1:
             return [self]
         sizes = self.row_splits.diff().tolist()
-        rows = {
-            name: getattr(self, name).split(sizes) for name in (*_ROWS, "dets") if name not in ("colors", "row_splits")
-        }
+        rows = {name: getattr(self, name).split(sizes) for name in ROWS if name not in ("colors", "row_splits")}
         rows["colors"] = (
             self.colors.split(sizes) if len(self.colors) == len(self.means2d) else [self.colors] * len(sizes)
         )
@@ -101,7 +97,9 @@ class Splats:
         return [replace(self, **dict(zip(rows, of_camera))) for of_camera in zip(*rows.values())]
 
 
-_ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in which the op returns them
+ROWS = tuple(field.name for field in fields(Splats))[:10]
+"""Members of `Splats` in the order in which the operator `project` returns them."""
+_project, _bin, _blend = map(Op, ("project", "bin", "blend"))
 
 
 @dataclass(frozen=True)
@@ -191,16 +189,11 @@ def project_once(
     """As `project`, with one row for a Gaussian in a camera, and what `turns_of` returns."""
     gaussians, batch = project_arguments(cameras, means3D, opacities, **optional)
     turns = turns_of(cameras, means3D)
-    *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch)
-    splats = Splats(
-        **dict(zip(_ROWS, rows)),
-        dets=saved[0],
-        width=batch["image_width"],
-        height=batch["image_height"],
-        footprint=batch["footprint"],
-        option=batch["option"],
-    )
-    return splats, turns
+    rows = dict(zip(ROWS, _project(**gaussians, **batch)))
+    if not rows["colors"].shape[1]:
+        rows["colors"] = rows["colors"].new_empty(0, 3)
+    size = {"width": batch["image_width"], "height": batch["image_height"]}
+    return Splats(**rows, **size, footprint=batch["footprint"], option=batch["option"]), turns
 
 
 def project_arguments(
@@ -227,14 +220,15 @@ def project_arguments(
         for name in common:
             if a[name] != shared[name]:
                 raise ValueError(f"settings must agree in {name}, got {shared[name]} and {a[name]} of camera {number}")
-    batch = {
-        "viewmatrix": torch.stack([a["viewmatrix"].reshape(4, 4) for a in arguments]),
-        "projmatrix": torch.stack([a["projmatrix"].reshape(4, 4) for a in arguments]),
-        "campos": torch.stack([a["campos"].reshape(3) for a in arguments]),
-        "lens": None if arguments[0]["lens"] is None else torch.stack([a["lens"] for a in arguments]),
-        "tanfovx": [a["tanfovx"] for a in arguments],
-        "tanfovy": [a["tanfovy"] for a in arguments],
-    }
+    batch = {name: [a[name] for a in arguments] for name in ("tanfovx", "tanfovy")}
+    for name, size in (("viewmatrix", (4, 4)), ("projmatrix", (4, 4)), ("campos", (3,)), ("lens", (-1,))):
+        given = [a[name] for a in arguments]
+        if given[0] is None:
+            batch[name] = None
+        elif len(given) == 1:
+            batch[name] = given[0].reshape(1, *size)
+        else:
+            batch[name] = torch.stack([t.reshape(size) for t in given])
     return gaussians, batch | shared
 
 
@@ -257,7 +251,7 @@ def list_tiles(splats: Splats, *, keep: bool = True) -> TileLists:
         `TileLists` of all cameras.
     """
     s = splats
-    tensors = torch.ops.analytic_rasterizer.bin(
+    (tensors,) = _bin(
         means2d=s.means2d.detach(),
         cov2d=s.cov2d.detach(),
         dets=s.dets,
@@ -314,7 +308,7 @@ def blend(
         background = background.expand(shape)
     if means2d_abs is not None:
         check_tensors(s.means2d.device, means2d_abs=means2d_abs)
-    image, alpha, _ = torch.ops.analytic_rasterizer.blend(
+    image, alpha, _ = _blend(
         means2d=s.means2d,
         cov2d=s.cov2d,
         opacities=s.opacities,

@@ -830,21 +830,23 @@ def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
 
 
-def test_saved_ids_that_are_no_gaussians(device):
+def test_saved_counts_that_are_none(device):
     """The CPU refuses them; CUDA, which would have to wait for the answer, leaves their rows out."""
     function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
     named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
     expected = function(**named)[0]
-    dets, ids, splits = named["saved"]
-    wrong = ids.clone()
-    wrong[:2] = torch.tensor([-3, 2**30], dtype=torch.int32)
-    named["saved"] = [dets, wrong, splits]
-    if device == "cpu":
-        with pytest.raises(ValueError, match="saved must be what project saved"):
-            function(**named)
-        return
-    # Of the second camera, whose rows are right, the gradients remain.
-    assert torch.allclose(2 * function(**named)[0][ids[:2].long()], expected[ids[:2].long()])
+    ends, splits = named["saved"]
+    for wrong in (2**30 + torch.arange(ends.shape[1], device=device), torch.tensor(-3, device=device)):
+        counts = ends.clone()
+        counts[0] = wrong
+        named["saved"] = [counts, splits]
+        if device == "cpu":
+            with pytest.raises(ValueError, match="saved must be what project saved"):
+                function(**named)
+            continue
+        found = function(**named)[0]
+    if device != "cpu":  # of the second camera, whose rows are right, the gradients remain
+        assert torch.allclose(2 * found, expected)
 
 
 def test_saved_splits_that_do_not_rise(device):
@@ -931,6 +933,13 @@ def _calls(footprint, options, device, full):
         splats = ar.project([settings, settings], **leaves)
         image, alpha = ar.blend(splats, ar.list_tiles(splats), torch.ones(len(splats.means2d), 5, device=device))
         (image.sum() + alpha.sum()).backward()
+        of_rows = [t.detach().requires_grad_() for t in (splats.means2d, splats.cov2d, splats.opacities)]
+        table = torch.ones(len(splats.means2d), 4 if full else 3, device=device, requires_grad=True)
+        others = {"dets": splats.dets, "depths": splats.depths.detach(), "row_splits": splats.row_splits}
+        composited = torch.ops.analytic_rasterizer.composite(
+            *of_rows, table, torch.zeros(2, 3, device=device), None, **others, **splats.size, expected=full
+        )
+        (composited[0].sum() + composited[1].sum()).backward()
         offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
         ar.footprint_weight(offset.requires_grad_(), cov2d, footprint, **dict(options)).sum().backward()
     return mode.first
@@ -938,7 +947,7 @@ def _calls(footprint, options, device, full):
 
 OPS = {
     *("rasterize", "rasterize_timed", "rasterize_vjp", "project", "project_vjp", "bin", "blend", "blend_vjp"),
-    *("inspect", "footprint_weight", "footprint_weight_vjp"),
+    *("composite", "composite_vjp", "inspect", "footprint_weight", "footprint_weight_vjp"),
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, ..., test_distributed.py
     *(f"{name}{suffix}" for name in ("ssim_map", "l1_ssim", "activate", "correct_colors") for suffix in ("", "_vjp")),

@@ -78,7 +78,8 @@ template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
 /// Reads row i, whose numbers may be any. False if such a Gaussian would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
-  out = {rows.means2d[i], {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
+  const Vec2<T> m = rows.means2d[i];
+  out = {{m.x - rows.center, m.y - rows.center}, {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
@@ -253,19 +254,6 @@ AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>&
   return grad;
 }
 
-template <typename T> AR_HD bool has_gradient(const ProjectedRowGrads<T>& rows, int64_t row) {
-  const Vec2<T> mean = rows.means2d[row];
-  const Sym2<T> cov = rows.cov2d[row];
-  bool found = mean.x != T(0) || mean.y != T(0) || cov.xx != T(0) || cov.xy != T(0) || cov.yy != T(0) ||
-               rows.opacities[row] != T(0);
-  if (rows.depths) found = found || rows.depths[row] != T(0);
-  if (rows.colors) {
-    const Vec3<T> color = rows.colors[row];
-    found = found || color.x != T(0) || color.y != T(0) || color.z != T(0);
-  }
-  return found;
-}
-
 template <typename T>
 AR_HD void write_packed_grad(T* to, int width, Vec2<T> mean, Sym2<T> cov, T opacity, Vec3<T> color, Vec2<T> absolute) {
   to[kPackedMean] = mean.x, to[kPackedMean + 1] = mean.y;
@@ -275,16 +263,15 @@ AR_HD void write_packed_grad(T* to, int width, Vec2<T> mean, Sym2<T> cov, T opac
   if (width > kPackedAbsolute) to[kPackedAbsolute] = absolute.x, to[kPackedAbsolute + 1] = absolute.y;
 }
 
-template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGrads<T>& rows, int64_t row, T opacity) {
-  const Sym2<T> g = rows.cov2d[row];
-  return {{rows.means2d[row], {T(1), T(0), T(0), T(1)}, {g.xx, T(0.5) * g.xy, g.yy}, T(0), T(0), GradFrame::kPixels},
-          opacity * rows.opacities[row]};
+template <class Cam, typename T>
+AR_HD Vec3<T> shown_depth_vjp(const Cam& camera, Vec3<T> view, const ShownGrad<T>& shown) {
+  return depth_vjp(camera, view, shown.depth);
 }
 
 /// Writes every gradient of Gaussian i but out.shs, and adds that of a full camera to `camera_grad`, if not null.
 /// grad_of(covariance, opacity) returns the ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp.
-template <class Cam, typename T, class GradOf, class Out>
-AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, ShownGrad<T> shown,
+template <class Cam, typename T, class GradOf, class Shown, class Out>
+AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, const Shown& shown,
                        const Vec3<T>* sh, Vec3<T>* dL_dsh, const Out& out, CameraGrad<T>* camera_grad = nullptr) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
@@ -292,7 +279,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   const ProjectedGrad<T> projected = grad_of(seen.cov, seen.amp * g.opacities[i]);
   const SplatGrad<T>& grad = projected.splat;
   JacobianGrad<T> dL_djacobian;
-  Vec3<T> dL_dview = depth_vjp(camera, mean.view, shown.depth);
+  Vec3<T> dL_dview = shown_depth_vjp(camera, mean.view, shown);
   bool has_blur = false;
   if constexpr (Cam::kFull) {
     const Blur<T> blur = blur_of(camera, mean.view);

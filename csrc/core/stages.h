@@ -77,6 +77,9 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
+/// Which depth of a Gaussian: that of the camera's model, camera-space z, or the distance from the camera.
+enum class DepthKind : int32_t { kNone, kOfModel, kZ, kDistance };
+
 /// Two more sums per splat, for density control: of positive functions of each pixel's dL/dmean, which do not cancel.
 enum class MeanSums : int32_t {
   kNone,
@@ -182,6 +185,11 @@ template <typename T> struct ShownGrad {
   Vec3<T> color;
   T depth;
 };
+/// Of a row, with two kinds of depth.
+template <typename T> struct RowShownGrad : ShownGrad<T> {
+  T shown_depth;
+  DepthKind order, shown;
+};
 
 /// From Gaussians to splats, or to ProjectedRows.
 template <typename T> struct ProjectParams {
@@ -196,12 +204,54 @@ template <typename T> struct ProjectParams {
 
 /// The splats of the public stages, which no footprint has shaped. Row i of every array is splat i.
 template <typename T> struct ProjectedRows {
-  Vec2<T>* means2d;  ///< px
-  Sym2<T>* cov2d;    ///< px^2
-  T* dets;           ///< of cov2d, px^4: from its entries they would cancel
-  T* opacities;      ///< with the amplitude of a camera's blur
-  T* depths;         ///< world units
-  Vec3<T>* colors;   ///< or null
+  Vec2<T>* means2d = nullptr;  ///< px
+  Sym2<T>* cov2d = nullptr;    ///< px^2
+  T* dets = nullptr;           ///< of cov2d, px^4: from its entries they would cancel; negative: touches no pixel
+  T* opacities = nullptr;      ///< with the amplitude of a camera's blur
+  T* depths = nullptr;         ///< world units
+  Vec3<T>* colors = nullptr;   ///< or null
+  T center = T(0);             ///< where pixels have their centres in means2d [px]
+};
+
+/// Where the rows of a camera's Gaussians are among those of all cameras.
+struct RowPlaces {
+  const int32_t* rows = nullptr;   ///< [n] row of a Gaussian, or -1
+  const int32_t* ends = nullptr;   ///< [n] or else: how many Gaussians up to and including this one have a row
+  const int32_t* radii = nullptr;  ///< [rows, 2] or else: every Gaussian has a row, which counts if this is positive
+  int64_t first = 0, last = 0;     ///< with `ends`: rows of the camera, the last not among them
+
+  /// -1: none.
+  AR_HD int64_t of(int64_t i) const {
+    if (rows) return rows[i];
+    if (!ends) return radii && radii[2 * (first + i)] <= 0 ? -1 : first + i;
+    const int32_t before = i > 0 ? ends[i - 1] : 0;
+    return ends[i] > before && before >= 0 && first + before < last ? first + before : -1;
+  }
+};
+
+/// Which Gaussians have a row, and what is in it.
+template <typename T> struct RowRules {
+  DepthKind order = DepthKind::kOfModel, shown = DepthKind::kNone;
+  bool measured = false;  ///< by RowMeasure (core/rows.h)
+  // Of a RowMeasure:
+  T variance = T(0);          ///< of its ellipse, beyond the covariance [px^2]
+  bool compensated = false;   ///< its opacity keeps the integral
+  T radius_clip = T(0);       ///< [px]
+  T near = T(0), far = T(0);  ///< of the depth by `order`
+};
+
+/// What is written of every row. Pointers may be null, except those of ProjectedRows.
+template <typename T> struct RowOutputs : ProjectedRows<T> {
+  T* features = nullptr;  ///< [rows, stride]
+  int64_t stride = 0;
+  bool colored = false, shows_depth = false;  ///< three colours are their first columns, a depth their last
+  int32_t* radii = nullptr;                   ///< [rows] 3DGS's; [rows, 2] of a RowMeasure
+  Vec3<T>* conics = nullptr;                  ///< [rows] of a RowMeasure, as are the opacities
+  T* shown_opacities = nullptr;               ///< [rows]
+  int32_t* gaussian_ids = nullptr;            ///< [rows]
+  int32_t* camera_ids = nullptr;              ///< [rows]
+  int32_t camera = 0;
+  RowPlaces places;  ///< without `ends` a table, in which Gaussians without a row have zeros, and the determinant -1
 };
 
 /// Sent to other ranks.
@@ -223,13 +273,16 @@ static_assert(offsetof(PackedRow<float>, depth) == kPackedDepth * sizeof(float))
 inline constexpr int kPackedMean = 0, kPackedCov = 2, kPackedOpacity = 5, kPackedColor = 6, kPackedAbsolute = 9;
 inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
 
+/// Null columns are zero.
 template <typename T> struct ProjectedRowGrads {
-  const int32_t* rows;  ///< [n] row of a Gaussian, or -1
+  RowPlaces places;
   Column<const Vec2<T>> means2d;
   Column<const Sym2<T>> cov2d;  ///< xy doubled, see Sym2
   Column<const T> opacities;
-  Column<const T> depths;        ///< or null
-  Column<const Vec3<T>> colors;  ///< or null
+  Column<const T> depths;  ///< of the kind `order`
+  Column<const Vec3<T>> colors;
+  Column<const T> shown_depths;  ///< of the kind `shown`
+  DepthKind order = DepthKind::kOfModel, shown = DepthKind::kNone;
 };
 
 /// Where `project_rows` writes rows of several cameras.
@@ -248,6 +301,7 @@ template <typename T> struct ShapeRowsParams {
   ProjectedRows<T> rows;  ///< without colours: black
   FootprintChoice footprint;
   TileGrid grid;
+  bool any_color;              ///< a colour that is not finite is drawn, else its row touches no tile
   T* splats;                   ///< [n] SplatRow
   const PackedRow<T>* packed;  ///< [n] instead of `rows`, or null
   /// [n, 4] cov2d and determinants, [n] opacities, for the adjoint; or null.
@@ -262,7 +316,8 @@ template <typename T> struct RowGradsParams {
   Vec2<T>* dL_dmeans2d;
   Sym2<T>* dL_dcov2d;  ///< xy doubled, see Sym2
   T* dL_dopacities;
-  Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
+  Vec2<T>* absolute;    ///< [n] sums over pixels of |dL/dmeans2d|, or null
+  Vec3<T>* dL_dcolors;  ///< [n] of the colours in the splats, or null
   // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients, instead of the
   // above.
   const T *kept_covs, *kept_opacities;

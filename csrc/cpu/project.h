@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "core/project.h"
+#include "core/rows.h"
 #include "cpu/chunks.h"
 #include "cpu/prefetch.h"
 
@@ -61,36 +61,47 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
   });
 }
 
-/// Radii as of project(). Without colours, these count as finite.
+/// Writes rows, packed rows or, for who counts them, flags. Radii are those of project(); without colours, these count
+/// as finite.
 template <template <typename> class Cam, typename T> void project_rows(const cpu::ProjectRowsParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
+  const bool with_color = p.rows.colored || p.packed.rows;
   for_each_chunk(g.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
-      if (p.radii) p.radii[i] = 0;
       ProjectedGaussian<T> projected;
-      ProjectedMean<T> mean;
-      if (!may_be_visible(camera, g, i, p.bounds, mean) || !project_gaussian(camera, g, i, mean, projected)) continue;
+      ProjectedMean<T> mean = {};
       SplatRow<T> splat = {};
-      const int radius = shape_splat(projected, p.footprint, camera.grid, splat);
-      if (radius == 0) continue;
-      const bool touches = splat.level > T(0);
-      bool finite = true;
-      if (p.rows.colors || p.packed.rows) {
-        finite = splat_color(camera, g, i, coefficients_of(g.shs, g.sh_stride, i), splat.color);
-        if (!finite) splat.color = {T(0), T(0), T(0)};
+      int radius = 0;
+      if (may_be_visible(camera, g, i, p.bounds, mean) && project_gaussian(camera, g, i, mean, projected))
+        radius = shape_splat(projected, p.footprint, camera.grid, splat);
+      const bool projects = radius > 0;
+      if (projects && with_color && !splat_color(camera, g, i, coefficients_of(g.shs, g.sh_stride, i), splat.color)) {
+        splat.color = {T(0), T(0), T(0)};
+        if (splat.level > T(0)) radius = 0;
       }
-      const bool culled = touches && !finite;
-      if (p.packed.rows) write_packed(p.packed, i, projected, splat.color, culled ? 0 : radius);
-      if (p.rows.colors) p.rows.colors[i] = splat.color;
-      if (culled || !p.radii) continue;
-      p.radii[i] = radius;
-      if (!p.rows.means2d) continue;
-      p.rows.means2d[i] = projected.mean;
-      p.rows.cov2d[i] = {projected.cov.xx, projected.cov.xy, projected.cov.yy};
-      p.rows.dets[i] = projected.cov.det;
-      p.rows.opacities[i] = projected.opacity;
-      p.rows.depths[i] = projected.depth;
+      if (p.packed.rows) {
+        if (projects) write_packed(p.packed, i, projected, splat.color, radius);
+        continue;
+      }
+      RowMeasure<T> measure = {};
+      bool drawn = radius > 0;
+      if (drawn) projected.depth = order_depth(p.rules.order, camera, mean.view);
+      if (drawn && p.rules.measured) {
+        measure = measure_row(projected, p.rules, camera.grid);
+        drawn = measure.drawn;
+      }
+      if (p.flags) {
+        p.flags[i] = drawn;
+        continue;
+      }
+      const int64_t row = p.rows.places.of(i);
+      if (drawn) {
+        const T shown = p.rows.shows_depth ? depth_by(p.rules.shown, camera, mean.view) : T(0);
+        write_row(p.rows, row, i, projected, splat.color, shown, radius, measure);
+      } else if (!p.rows.places.ends) {
+        write_no_row(p.rows, row, i);
+      }
     }
   });
 }
@@ -140,16 +151,13 @@ void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p, const Out& out) {
   for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
-      const int64_t row = p.rows.rows[i];
+      const int64_t row = p.rows.places.of(i);
       if (row < 0 || !has_gradient(p.rows, row)) {
         zero_grads(g, i, out);
         continue;
       }
-      ShownGrad<T> shown = {};
-      if (p.rows.colors) shown.color = p.rows.colors[row];
-      if (p.rows.depths) shown.depth = p.rows.depths[row];
       const auto grad_of = [&](const Cov2d<T>&, T opacity) { return projected_grad(p.rows, row, opacity); };
-      ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
+      ar::project_vjp(camera, g, i, grad_of, shown_grad(p.rows, row), coefficients_of(g.shs, g.sh_stride, i),
                       coefficients_of(out.shs, g.sh_stride, i), out, p.camera_grads ? &p.camera_grads[chunk] : nullptr);
     }
   });

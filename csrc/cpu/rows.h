@@ -21,7 +21,7 @@ template <typename T> void shape_rows(const cpu::ShapeRowsParams<T>& p) {
       }
       if ((p.packed || p.rows.colors) && splat.level > T(0)) {
         splat.color = p.packed ? p.packed[i].color : p.rows.colors[i];
-        if (!all_finite(&splat.color.x, 3)) splat = {};
+        if (!p.any_color && !all_finite(&splat.color.x, 3)) splat = {};
       }
       splats[i] = splat;
     }
@@ -44,7 +44,7 @@ template <typename T> void row_grads(const cpu::RowGradsParams<T>& p) {
         const int64_t pair = p.pairs.positions[k];
         const T* row = p.pair_grads + pair * p.pair_stride;
         sums = sums + *reinterpret_cast<const PairGrad<T>*>(row);
-        if (p.packed) color += *reinterpret_cast<const Vec3<T>*>(row + cpu::kPairNumbers);
+        if (p.packed || p.dL_dcolors) color += *reinterpret_cast<const Vec3<T>*>(row + cpu::kPairNumbers);
         if (p.pair_means) absolute = absolute + p.pair_means[pair];
       }
       if (first != last) {
@@ -64,6 +64,7 @@ template <typename T> void row_grads(const cpu::RowGradsParams<T>& p) {
       p.dL_dcov2d[i] = dL_dcov;
       p.dL_dopacities[i] = dL_dopacity;
       if (p.absolute) p.absolute[i] = absolute;
+      if (p.dL_dcolors) p.dL_dcolors[i] = color;
     }
   });
 }

@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "core/bin.h"
-#include "core/project.h"
+#include "core/rows.h"
 #include "core/weight.h"
 
 namespace ar::cpu {
@@ -39,8 +39,10 @@ template <typename T> struct ProjectParams : ar::ProjectParams<T> {
 template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
-  ProjectedRows<T> rows;  ///< [gaussians] where the radius is not 0. Or null.
-  PackedRows<T> packed;   ///< Instead of rows and radii.
+  RowRules<T> rules;
+  RowOutputs<T> rows;    ///< Of a row that is not drawn, nothing is written.
+  PackedRows<T> packed;  ///< Instead of rows.
+  int32_t* flags;        ///< [gaussians] instead of both: 1 for a Gaussian that has a row, else 0.
 };
 
 template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {

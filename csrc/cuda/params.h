@@ -11,7 +11,7 @@
 
 #include "core/bin.h"
 #include "core/camera.h"
-#include "core/project.h"
+#include "core/rows.h"
 #include "core/weight.h"
 #include "cuda/chunk_plan.h"
 
@@ -92,9 +92,10 @@ struct ProjectRowsParams {
   Gaussians<float> gaussians;
   FootprintChoice footprint;
   CullBounds<float> bounds;
-  ProjectedRows<float> rows;  ///< [n] if the radius is not 0; or null
-  int32_t* radii;             ///< [n]
-  PackedRows<float> packed;   ///< instead of rows and radii, or null
+  RowRules<float> rules;
+  RowOutputs<float> rows;
+  PackedRows<float> packed;  ///< instead of rows, or null
+  int32_t* flags;            ///< [n] instead of both: 1 for a Gaussian that has a row, else 0
 };
 
 /// From public rows to splats.

@@ -100,45 +100,56 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
 }
 
-/// A thread per Gaussian. Cam: as above. Writes public rows and radii, or packed rows.
+/// A thread per Gaussian. Cam: as above. Writes rows, packed rows or flags.
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  __shared__ SharedCamera<Cam> shared_camera;
+  const Cam& camera = shared_camera.load(params.camera);
   const Gaussians<float>& g = params.gaussians;
+  const RowOutputs<float>& to = params.rows;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  const Cam camera = load_camera_as<Cam>(params.camera);
   ProjectedGaussian<float> projected = {};
   SplatRow<float> splat = {};
   int radius = 0;
-  ProjectedMean<float> mean;
+  ProjectedMean<float> mean = {};
   if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean) && project_gaussian(camera, g, i, mean, projected))
     radius = shape_splat(projected, params.footprint, camera.grid, splat);
-  const bool has_row = radius > 0;
-  if (params.rows.colors || params.packed.rows) {
+  const bool projects = radius > 0;
+  if (to.colored || params.packed.rows) {
     ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-    const uint32_t seen = __ballot_sync(kAllLanes, has_row);
+    const uint32_t seen = __ballot_sync(kAllLanes, projects);
     if (g.shs && seen) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), seen);
     wait_for_copies();
-    if (radius > 0 && !splat_color(camera, g, i, rows.row(), splat.color)) {
+    if (projects && !splat_color(camera, g, i, rows.row(), splat.color)) {
       if (splat.level > 0) radius = 0;
       splat.color = {0, 0, 0};
     }
   }
   if (i >= g.n) return;
   if (params.packed.rows) {
-    if (has_row) write_packed(params.packed, i, projected, splat.color, radius);
+    if (projects) write_packed(params.packed, i, projected, splat.color, radius);
     return;
   }
-  params.radii[i] = radius;
-  if (radius == 0 || !params.rows.means2d) return;
-  const Cov2d<float>& cov = projected.cov;
-  params.rows.means2d[i] = projected.mean;
-  params.rows.cov2d[i] = {cov.xx, cov.xy, cov.yy};
-  params.rows.dets[i] = cov.det;
-  params.rows.opacities[i] = projected.opacity;
-  params.rows.depths[i] = projected.depth;
-  if (params.rows.colors) params.rows.colors[i] = splat.color;
+  RowMeasure<float> measure = {};
+  bool drawn = radius > 0;
+  if (drawn) projected.depth = order_depth(params.rules.order, camera, mean.view);
+  if (drawn && params.rules.measured) {
+    measure = measure_row(projected, params.rules, camera.grid);
+    drawn = measure.drawn;
+  }
+  if (params.flags) {
+    params.flags[i] = drawn;
+    return;
+  }
+  const int64_t row = to.places.of(i);
+  if (drawn) {
+    const float shown = to.shows_depth ? depth_by(params.rules.shown, camera, mean.view) : 0;
+    write_row(to, row, i, projected, splat.color, shown, radius, measure);
+  } else if (!to.places.ends) {
+    write_no_row(to, row, i);
+  }
 }
 
 /// A thread per public row. Writes a splat and what bin reads.
@@ -165,7 +176,8 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   }
   if (valid && shape_splat(projected, params.footprint, params.grid, splat) == 0) splat.level = 0;
   const Vec3<float>& color = splat.color;
-  if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
+  if (!params.any_color && !(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor)))
+    splat.level = 0;
   SplatTiles tiles = {};
   if (splat.level > 0) tiles = splat_tiles_of(support_of(splat, params.footprint.index), params.grid);
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;

@@ -158,17 +158,14 @@ struct FromRows {
   const ProjectRowsVjpParams& params;
 
   __device__ PairRange range(int64_t i) const {
-    const int32_t row = params.rows.rows[i];
+    const auto row = int32_t(params.rows.places.of(i));
     return {row, row >= 0 && has_gradient(params.rows, row) ? 1 : 0};
   }
   __device__ int64_t sum(int64_t, PairRange range) const { return range.first; }  ///< the row
   template <class Cam, class Use>
   __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, int64_t row, Use&& use) const {
-    ShownGrad<float> shown = {{0, 0, 0}, 0};
-    if (params.rows.colors) shown.color = params.rows.colors[row];
-    if (params.rows.depths) shown.depth = params.rows.depths[row];
-    use([&](const Cov2d<float>&, float opacity) { return projected_grad(params.rows, row, opacity); }, shown,
-        Vec2<float>{0, 0});
+    use([&](const Cov2d<float>&, float opacity) { return projected_grad(params.rows, row, opacity); },
+        shown_grad(params.rows, row), Vec2<float>{0, 0});
   }
 };
 
@@ -214,7 +211,7 @@ __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kF
   g.sh_stride = min(g.sh_stride, rows.kCount);  // in shared memory
   CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
-    from.visit(camera, g, i, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
+    from.visit(camera, g, i, sums, [&](const auto& grad_of, const auto& shown, Vec2<float> means) {
       const auto grad_of_splat = [&](const Cov2d<float>& cov, float opacity) {
         forget_loads();
         return grad_of(cov, opacity);
@@ -284,6 +281,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   params.dL_dcov2d[i] = {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy};
   params.dL_dopacities[i] = dL_dopacity;
   if (params.absolute) params.absolute[i] = sums.mean_sums();
+  if (params.dL_dcolors) params.dL_dcolors[i] = sums.color();
 }
 
 /// A thread per splat.

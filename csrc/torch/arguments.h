@@ -100,12 +100,39 @@ struct RasterizeArguments : Inputs, FootprintArguments {
 };
 
 /// Tensors of C cameras: (C, 4, 4), (C, 4, 4), (C, 3), (C, kLensWidth). means2D is a result.
-struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArguments {
+struct BatchArguments : SceneArguments<std::vector<double>>, FootprintArguments {
   template <class Visit> void each(Visit&& visit) {
     SceneArguments::each([&](std::string_view name, auto& value) {
       if (name != "means2D") visit(name, value);
     });
     FootprintArguments::each(visit);
+  }
+};
+
+/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each. Harmonics and values may be of one batch or
+/// camera more: (P, ...), (B, P, ...) or (C, P, ...).
+struct ProjectArguments : BatchArguments {
+  OptionalTensor values;       ///< (P, K), features after the colours.
+  std::vector<int64_t> table;  ///< Sizes (..., C, P) of a table with a row for every Gaussian in every camera, or none.
+  bool measured = false;       ///< Rows and radii as in gsplat.
+  std::string order = "model", shown = "none";  ///< Kinds of depth: of the rows, and as their last feature.
+  double center = 0;
+  double near = 0, far = 0, radius_clip = 0;  ///< Of a RowMeasure.
+  bool keep = false;
+
+  bool is_table() const { return !table.empty(); }
+  template <class Visit> void each(Visit&& visit) {
+    BatchArguments::each(visit);
+    visit("values=None", values);
+    visit("table=[]", table);
+    visit("measured=False", measured);
+    visit("order=\"model\"", order);
+    visit("shown=\"none\"", shown);
+    visit("center=0.0", center);
+    visit("near=0.0", near);
+    visit("far=0.0", far);
+    visit("radius_clip=0.0", radius_clip);
+    visit("keep=False", keep);
   }
 };
 
@@ -164,6 +191,34 @@ struct BlendArguments : ImageArguments {
     visit("row_splits", row_splits);
     visit("lists", lists);
     ImageArguments::each(visit);
+    visit("keep=False", keep);
+  }
+};
+
+/// Rows of C cameras to their images: `bin` and `blend` in one, for rows as a table too, (..., 2) and (...,).
+struct CompositeArguments : ImageArguments {
+  Tensor means2d, cov2d, opacities, features;
+  OptionalTensor background;   ///< (..., K), of the first channels, zero behind others.
+  OptionalTensor means2d_abs;  ///< As in BlendArguments.
+  Tensor dets, depths, row_splits;
+  double center = 0;      ///< Where pixels have their centres in means2d.
+  bool expected = false;  ///< The last channel is divided by alpha.
+  bool keep = false;
+  int64_t background_channels = 0;  ///< Of `background` as it was given; check() fills it up.
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("means2d", means2d);
+    visit("cov2d", cov2d);
+    visit("opacities", opacities);
+    visit("features", features);
+    visit("background", background);
+    visit("means2d_abs", means2d_abs);
+    visit("dets", dets);
+    visit("depths", depths);
+    visit("row_splits", row_splits);
+    ImageArguments::each(visit);
+    visit("center=0.0", center);
+    visit("expected=False", expected);
     visit("keep=False", keep);
   }
 };
@@ -328,7 +383,7 @@ struct AdamArguments {
 };
 
 /// Rows from `room` on are not written.
-struct PackArguments : ProjectArguments {
+struct PackArguments : BatchArguments {
   WrittenTensor<'a'> rows;   ///< (room, kPackedWidth).
   WrittenTensor<'b'> radii;  ///< (room,) int32.
   WrittenTensor<'c'> ids;    ///< (room,) int32.
@@ -340,21 +395,21 @@ struct PackArguments : ProjectArguments {
     visit("rows", rows);
     visit("radii", radii);
     visit("ids", ids);
-    ProjectArguments::each(visit);
+    BatchArguments::each(visit);
     visit("ends", ends);
     visit("firsts", firsts);
     visit("first_id", first_id);
   }
 };
 
-struct PackVjpArguments : ProjectArguments, PackedRanges {
+struct PackVjpArguments : BatchArguments, PackedRanges {
   Tensor dL_drows;          ///< (n, kPackedGradWidth or more).
   Tensor ids;               ///< (n,) int32, of `pack_rows_`.
-  std::vector<bool> needs;  ///< Of ProjectArguments.
+  std::vector<bool> needs;  ///< Of BatchArguments.
 
   template <class Visit> void each(Visit&& visit) {
     visit("dL_drows", dL_drows);
-    ProjectArguments::each(visit);
+    BatchArguments::each(visit);
     visit("ids", ids);
     PackedRanges::each(visit);
     visit("needs", needs);

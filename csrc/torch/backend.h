@@ -123,8 +123,35 @@ struct RowTensors {
   Tensor absolute;  ///< Of a gradient: (n, 2) sums of |dL/dmeans2d|.
   Tensor packed;    ///< PackedRow or its gradient, instead of all others.
   KeptRows kept;
+  double center = 0;       ///< Where pixels have their centres in means2d.
+  bool any_color = false;  ///< A colour that is not finite is drawn.
 
   std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
+};
+
+/// What `project_rows` writes (RowOutputs in core/stages.h): rows of all cameras.
+struct ProjectedTensors {
+  Tensor means2d, cov2d, dets, opacities, depths;
+  Tensor features;                  ///< (n, K), three colours first if `colored`, a depth last if `shows_depth`.
+  Tensor radii;                     ///< (n,), or (n, 2) of a RowMeasure, which has conics too.
+  Tensor conics, shown_opacities;   ///< Or undefined.
+  Tensor gaussian_ids, camera_ids;  ///< Or undefined.
+  Tensor ends;                      ///< (P,) int32 of this camera; undefined: a table.
+  Tensor flags;                     ///< (P,) int32, instead of all others.
+  bool colored = false, shows_depth = false;
+  int64_t camera = 0, first = 0, last = 0;  ///< The camera's number; its first row and, with `ends`, its last.
+  double center = 0;
+};
+
+/// The gradient of what `project_rows` wrote; undefined tensors are zero.
+struct ProjectedGrads {
+  Tensor means2d, cov2d, opacities, depths;
+  Tensor features;  ///< As ProjectedTensors::features.
+  Tensor packed;    ///< Instead of all others.
+  bool colored = false, shows_depth = false;
+  DepthKind order = DepthKind::kOfModel, shown = DepthKind::kNone;
+  Tensor rows, ends, radii;  ///< Of RowPlaces, or undefined.
+  int64_t first = 0, last = 0;
 };
 
 /// Where `pack_rows` writes packed rows (PackedRows in core/stages.h).
@@ -189,8 +216,8 @@ class Backend {
   /// Writes radii (P,) int32, and its columns of `channels`.
   virtual SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                                const Tensor& radii) = 0;
-  /// Writes radii, and rows (P, ...) where the radius is not 0. Without `rows`, radii ignore colours.
-  virtual void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) = 0;
+  virtual void project_rows(const Inputs& in, const Pass& pass, const RowRules<double>& rules,
+                            const ProjectedTensors& rows) = 0;
   virtual void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) = 0;
   /// Writes rows.kept if it is given.
   virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
@@ -211,9 +238,8 @@ class Backend {
   /// Writes `grads`. Returns parts of the camera's gradient, (parts, kCameraGradWidth).
   virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                              const ChannelTensors& channels, const Grads& grads) = 0;
-  /// The same from gradients of public rows. `rows` (P,) int32: row of each Gaussian, or -1. Adds if grads.add.
-  virtual Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
-                                  const Grads& grads) = 0;
+  /// The same from gradients of public rows. Adds if grads.add.
+  virtual Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) = 0;
   /// Writes dL_drows.
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                          const RowTensors& dL_drows) = 0;

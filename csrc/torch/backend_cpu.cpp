@@ -83,7 +83,8 @@ template <typename T> class CpuBackend final : public Backend {
     std::vector<int64_t> offsets(cpu::chunks_of(in.count()) + 1, 0);
     std::vector<uint8_t> candidates(in.count());
     cpu::ProjectParams<T> p = {};
-    set_projection<T>(p, in, pass, radii);
+    set_projection<T>(p, in, pass);
+    p.radii = pointer<int32_t>(radii);
     set_channels<T>(p, channels);
     p.threads = thread_count();
     p.candidates = candidates.data();
@@ -103,17 +104,20 @@ template <typename T> class CpuBackend final : public Backend {
     return out;
   }
 
-  void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) override {
+  void project_rows(const Inputs& in, const Pass& pass, const RowRules<double>& rules,
+                    const ProjectedTensors& rows) override {
     cpu::ProjectRowsParams<T> p = {};
-    set_projection<T>(p, in, pass, radii);
+    set_projection<T>(p, in, pass);
     p.threads = thread_count();
-    p.rows = projected_rows_of<T>(rows);
+    p.rules = row_rules_of<T>(rules);
+    p.rows = row_outputs_of<T>(rows);
+    p.flags = pointer<int32_t>(rows.flags);
     stages_of(pass.footprint).of(p.camera).project_rows(p);
   }
 
   void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
     cpu::ProjectRowsParams<T> p = {};
-    set_projection<T>(p, in, pass, Tensor());
+    set_projection<T>(p, in, pass);
     p.threads = thread_count();
     p.packed = packed_rows_of<T>(packed);
     if (p.packed.rows) stages_of(pass.footprint).of(p.camera).project_rows(p);
@@ -249,11 +253,10 @@ template <typename T> class CpuBackend final : public Backend {
     return camera_grads;
   }
 
-  Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
-                          const Grads& grads) override {
+  Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) override {
     cpu::ProjectRowsVjpParams<T> p = {};
     set_projection_vjp<T>(p, in, grads);
-    p.rows = projected_row_grads_of<T>(rows, dL_drows);
+    p.rows = projected_row_grads_of<T>(dL_drows);
     p.add = grads.add;
     p.threads = thread_count();
     const Tensor camera_grads = make_camera_grads(p, grads);

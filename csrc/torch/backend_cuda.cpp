@@ -39,7 +39,8 @@ class CudaBackend final : public Backend {
                        const Tensor& radii) override {
     SplatTensors out = make_splats(in.count());
     cuda::ProjectParams p = {};
-    set_projection<float>(p, in, pass, radii);
+    set_projection<float>(p, in, pass);
+    p.radii = pointer<int32_t>(radii);
     set_channels<float>(p, channels);
     p.grid = pass.grid;
     p.splats = pointer<float>(out.splats);
@@ -49,17 +50,20 @@ class CudaBackend final : public Backend {
     return out;
   }
 
-  void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) override {
+  void project_rows(const Inputs& in, const Pass& pass, const RowRules<double>& rules,
+                    const ProjectedTensors& rows) override {
     cuda::ProjectRowsParams p = {};
-    set_projection<float>(p, in, pass, radii);
-    p.rows = projected_rows_of<float>(rows);
+    set_projection<float>(p, in, pass);
+    p.rules = row_rules_of<float>(rules);
+    p.rows = row_outputs_of<float>(rows);
+    p.flags = pointer<int32_t>(rows.flags);
     cuda::project_rows(p, stream_);
     check_stage("project_rows", false);
   }
 
   void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
     cuda::ProjectRowsParams p = {};
-    set_projection<float>(p, in, pass, Tensor());
+    set_projection<float>(p, in, pass);
     p.packed = packed_rows_of<float>(packed);
     if (!p.packed.rows) return;
     cuda::project_rows(p, stream_);
@@ -272,11 +276,10 @@ class CudaBackend final : public Backend {
     return camera_grads;
   }
 
-  Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
-                          const Grads& grads) override {
+  Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) override {
     cuda::ProjectRowsVjpParams p = {};
     set_projection_vjp<float>(p, in, grads);
-    p.rows = projected_row_grads_of<float>(rows, dL_drows);
+    p.rows = projected_row_grads_of<float>(dL_drows);
     p.add = grads.add;
     const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_rows_vjp(p, stream_);

@@ -22,7 +22,7 @@ using c10::IValue;
 struct Parameter {
   py::str name;
   bool may_be_none;
-  c10::TypeKind kind;
+  c10::TypeKind kind, element = c10::TypeKind::AnyType;  ///< The latter of a list.
   std::optional<IValue> default_value;
 
   explicit Parameter(const c10::Argument& argument)
@@ -32,6 +32,7 @@ struct Parameter {
     c10::TypePtr type = argument.type();
     if (may_be_none) type = type->expectRef<c10::OptionalType>().getElementType();
     kind = type->kind();
+    if (kind == c10::TypeKind::ListType) element = type->containedType(0)->kind();
   }
 
   IValue value_of(py::handle given) const {
@@ -49,12 +50,26 @@ struct Parameter {
         return cast<bool>(given, "a bool");
       case c10::TypeKind::StringType:
         return cast<std::string>(given, "a string");
+      case c10::TypeKind::ListType:
+        return list_of(given);
       default:
         throw py::type_error(std::string(name) + " is of a type that Call does not take");
     }
   }
 
  private:
+  IValue list_of(py::handle given) const {
+    if (element == c10::TypeKind::FloatType) return cast<std::vector<double>>(given, "a list of floats");
+    if (element == c10::TypeKind::IntType) return cast<std::vector<int64_t>>(given, "a list of ints");
+    if (element != c10::TypeKind::TensorType || !PySequence_Check(given.ptr()))
+      throw py::type_error(std::string(name) + " is of a type that Call does not take");
+    c10::List<at::Tensor> tensors;
+    for (const py::handle& item : py::reinterpret_borrow<py::sequence>(given)) {
+      if (!THPVariable_Check(item.ptr())) throw py::type_error(std::string(name) + " must hold tensors");
+      tensors.push_back(THPVariable_Unpack(item.ptr()));
+    }
+    return tensors;
+  }
   template <class Value> Value cast(py::handle given, const char* what) const {
     try {
       return given.cast<Value>();

@@ -3,7 +3,9 @@
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>
+#include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/isfinite.h>
+#include <ATen/ops/zeros.h>
 
 #include <algorithm>
 #include <cmath>
@@ -213,11 +215,38 @@ void check_values(const RasterizeArguments& a) {
   if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
 }
 
-int64_t check_cameras(const ProjectArguments& a) {
-  check_shape(a.means3D.dim() == 2 && a.means3D.size(1) == 3, a.means3D, "means3D", "(P, 3)");
+namespace {
+
+int64_t batches_of(const ProjectArguments& a) { return a.means3D.dim() == 3 ? a.means3D.size(0) : 1; }
+int64_t cameras_of(const ProjectArguments& a) { return a.viewmatrix.size(0); }
+
+/// A tensor of all batches has `dims` + 1 dimensions; of `by_camera` too.
+void check_batches(const ProjectArguments& a, const OptionalTensor& t, const char* name, int64_t dims, bool by_camera) {
+  if (!t || (t->dim() == dims && batches_of(a) == 1) || t->dim() < dims) return;
+  const bool ok = t->dim() == dims + 1 && (t->size(0) == batches_of(a) || (by_camera && t->size(0) == cameras_of(a)));
+  TORCH_CHECK_VALUE(ok, name, " must have a part for each of ", batches_of(a), " batches",
+                    by_camera ? " or for each camera" : "", ", got shape ", shape_of(*t));
+}
+
+}  // namespace
+
+ProjectArguments batch_of(const BatchArguments& a) {
+  ProjectArguments out;
+  static_cast<BatchArguments&>(out) = a;
+  return out;
+}
+
+int64_t check_cameras(ProjectArguments& a) {
+  check_shape((a.means3D.dim() == 2 || a.means3D.dim() == 3) && a.means3D.size(-1) == 3, a.means3D, "means3D",
+              "(P, 3)");
+  for (Tensor* matrix : {&a.viewmatrix, &a.projmatrix}) {
+    if (matrix->dim() == 2) *matrix = matrix->unsqueeze(0);
+  }
+  if (a.campos.dim() == 1) a.campos = a.campos.unsqueeze(0);
+  if (a.lens && a.lens->dim() == 1) a.lens = a.lens->unsqueeze(0);
   const bool ok = a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4;
   check_shape(ok, a.viewmatrix, "viewmatrix", "(C, 4, 4)");
-  const int64_t cameras = a.viewmatrix.size(0);
+  const int64_t cameras = cameras_of(a), batches = batches_of(a);
   check_rows(a.projmatrix, "projmatrix", cameras, {4, 4}, "(C, 4, 4)");
   check_rows(a.campos, "campos", cameras, {3}, "(C, 3)");
   if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, ("(C, " + std::to_string(kLensWidth) + ")").c_str());
@@ -227,12 +256,44 @@ int64_t check_cameras(const ProjectArguments& a) {
   TORCH_CHECK_VALUE(!(a.shs && a.colors_precomp), "at most one of shs and colors_precomp must be given, got both");
   TORCH_CHECK_VALUE(!a.colors_precomp || (a.colors_precomp->dim() == 2 && a.colors_precomp->size(1) == 3),
                     "colors_precomp must have shape (P, 3), got ", a.colors_precomp ? shape_of(*a.colors_precomp) : "");
+  TORCH_CHECK_VALUE(batches > 0 && cameras % batches == 0, "viewmatrix must have as many cameras for each of ", batches,
+                    " batches, got ", cameras);
+  check_batches(a, a.shs, "shs", 3, true);
+  check_batches(a, a.scales, "scales", 2, false);
+  check_batches(a, a.rotations, "rotations", 2, false);
+  check_batches(a, a.cov3D_precomp, "cov3D_precomp", 2, false);
+  if (batches > 1) check_batches(a, a.opacities, "opacities", 1, false);
+  TORCH_CHECK_VALUE(!a.is_table() || a.measured, "measured must be True for a table, got False");
+  TORCH_CHECK_VALUE(!a.is_table() || c10::multiply_integers(a.table) == cameras * a.means3D.size(-2),
+                    "table must be the sizes of ", cameras * a.means3D.size(-2), " rows, got ", text_of(a.table));
+  if (!a.values) return cameras;
+  check_batches(a, a.values, "values", 2, true);
+  const Like like{a.means3D, "means3D"};
+  like.check_type(*a.values, "values");
+  const int64_t p = a.means3D.size(-2), colors = a.shs || a.colors_precomp ? 3 : 0;
+  const bool fits = a.values->dim() >= 2 && a.values->size(-2) == p && a.values->size(-1) >= 1 &&
+                    a.values->size(-1) + colors + (a.shown != "none") <= kMaxChannels;
+  check_shape(fits, *a.values, "values", "(P, K) with P = ", p, " and at most ", kMaxChannels, " features in all");
   return cameras;
 }
 
+Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims) {
+  if (!t.defined() || t.dim() == dims) return t;
+  return t.select(0, t.size(0) == cameras_of(a) ? c : c / (cameras_of(a) / batches_of(a)));
+}
+
 Inputs inputs_of(const ProjectArguments& a, int64_t c) {
+  const auto part = [&](const OptionalTensor& t, int64_t dims) -> OptionalTensor {
+    return t ? OptionalTensor(part_of(a, c, *t, dims)) : std::nullopt;
+  };
   Inputs in;
-  static_cast<SceneTensors<OptionalTensor>&>(in) = a;
+  in.means3D = part_of(a, c, a.means3D, 2);
+  in.opacities = a.means3D.dim() == 3 ? part_of(a, c, a.opacities, 1) : a.opacities;
+  in.shs = part(a.shs, 3);
+  in.colors_precomp = a.colors_precomp;
+  in.scales = part(a.scales, 2);
+  in.rotations = part(a.rotations, 2);
+  in.cov3D_precomp = part(a.cov3D_precomp, 2);
   in.viewmatrix = a.viewmatrix[c];
   in.projmatrix = a.projmatrix[c];
   in.campos = a.campos[c];
@@ -275,6 +336,37 @@ void check(BlendArguments& a, const Pass& pass) {
     TORCH_CHECK_VALUE(lists.splats.size(0) == rows, "lists must be the output of list_tiles for these splats, got ",
                       lists.splats.size(0), " splats of camera ", c, " and not ", rows);
   }
+}
+
+void check(CompositeArguments& a) {
+  // Of a table, whose rows are those of a matrix.
+  for (Tensor* t : {&a.means2d, &a.cov2d}) {
+    if (t->dim() > 2) *t = t->reshape({-1, t->size(-1)});
+  }
+  for (Tensor* t : {&a.opacities, &a.dets, &a.depths}) {
+    if (t->dim() > 1) *t = t->reshape({-1});
+  }
+  if (a.means2d_abs && a.means2d_abs->dim() > 2) a.means2d_abs = a.means2d_abs->reshape({-1, 2});
+  check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
+  const Like like{a.means2d, "means2d"};
+  const int64_t cameras = a.row_splits.size(0) - 1;
+  like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  like.check_channels(a.features, "features", 'N', 'K', kMaxChannels);
+  like.check_rows_of(a.means2d_abs, "means2d_abs", {2}, "(N, 2)");
+  check_image_size(a.image_height, a.image_width);
+  const int64_t channels = a.features.size(1);
+  if (!a.background) {
+    a.background = at::zeros({cameras, channels}, a.means2d.options());
+    return;
+  }
+  Tensor& background = *a.background;
+  like.check_type(background, "background");
+  if (background.dim() > 2) background = background.reshape({-1, background.size(-1)});
+  const int64_t given = background.size(-1);
+  check_shape(background.dim() == 2 && background.size(0) == cameras && given <= channels, background, "background",
+              "(", cameras, ", K) with K at most ", channels);
+  a.background_channels = given;
+  background = given < channels ? at::constant_pad_nd(background, {0, channels - given}) : background.contiguous();
 }
 
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {

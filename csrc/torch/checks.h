@@ -15,6 +15,7 @@ void check_values(const Inputs& in, bool debug);
 void check_values(const RasterizeArguments& a);
 void check(BinArguments& a);
 void check(BlendArguments& a, const Pass& pass);
+void check(CompositeArguments& a);
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);
 void check(SsimArguments& a);
@@ -25,10 +26,16 @@ void check(PictureArguments& a);
 void check(CorrectArguments& a);
 void check(AdamArguments& a);
 
-/// Not yet checked.
+/// One batch.
+ProjectArguments batch_of(const BatchArguments& a);
+/// Of camera c. Not yet checked.
 Inputs inputs_of(const ProjectArguments& a, int64_t c);
-/// What inputs_of() relies on. Returns the number of cameras.
-int64_t check_cameras(const ProjectArguments& a);
+/// The part that camera c reads of a tensor whose rows have `dims` dimensions in one batch.
+Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims);
+/// The same of `t`, which is `values` or like it.
+inline Tensor values_of(const ProjectArguments& a, int64_t c, const Tensor& t) { return part_of(a, c, t, 2); }
+/// What these rely on. Matrices of a single camera may lack the first dimension. Returns the number of cameras.
+int64_t check_cameras(ProjectArguments& a);
 
 /// With respect to differentiable output number `output`: contiguous, or undefined.
 Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t output, const char* name, const Tensor& like,

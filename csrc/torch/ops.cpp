@@ -57,15 +57,18 @@ template <class Visit> void each_op(const Visit& visit) {
   const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved",
              *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved, Tensor seconds",
              *projected =
-                 "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor radii, "
-                 "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor[] saved",
+                 "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor features, Tensor radii, "
+                 "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor dets, Tensor conics, "
+                 "Tensor shown_opacities, Tensor[] saved",
              *blended = "Tensor image, Tensor alpha, Tensor[] saved", *gradients = "Tensor[] gradients";
   visit(Op<RasterizeArguments, rasterize>{}, "rasterize", rasterized);
   visit(Op<RasterizeArguments, rasterize_timed>{}, "rasterize_timed", timed);
   visit(Op<VjpArguments<RasterizeArguments>, rasterize_vjp>{}, "rasterize_vjp", gradients);
   visit(Op<ProjectArguments, project>{}, "project", projected);
   visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
-  visit(Op<ProjectArguments, count_rows>{}, "count_rows", "Tensor ends");
+  visit(Op<CompositeArguments, composite>{}, "composite", blended);
+  visit(Op<VjpArguments<CompositeArguments>, composite_vjp>{}, "composite_vjp", gradients);
+  visit(Op<BatchArguments, count_rows>{}, "count_rows", "Tensor ends");
   visit(Op<PackArguments, pack_rows>{}, "pack_rows_", "");
   visit(Op<PackVjpArguments, pack_rows_vjp>{}, "pack_rows_vjp", gradients);
   visit(Op<BlendRowsArguments, blend_rows>{}, "blend_rows", blended);

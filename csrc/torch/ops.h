@@ -18,13 +18,18 @@ Results rasterize(RasterizeArguments a);
 Results rasterize_timed(RasterizeArguments a);
 Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
 
-/// Rows, camera after camera: means2d, cov2d, opacities, depths, colors; radii, gaussian_ids, camera_ids, int32;
-/// row_splits (C + 1,) int64 on the CPU; saved: dets, gaussian_ids, row_splits.
+/// Rows, camera after camera: means2d, cov2d, opacities, depths, features (K,); radii, gaussian_ids, camera_ids, int32;
+/// row_splits (C + 1,) int64 on the CPU; dets; of a RowMeasure conics (3,) and shown_opacities, else empty; saved: what
+/// RowPlaces reads.
 Results project(ProjectArguments a);
 Results project_vjp(VjpArguments<ProjectArguments> a);
 
+/// image (C, H, W, K), alpha (C, H, W, 1), saved: by camera ListTensors and BlendState; of `expected` alpha and depth.
+Results composite(CompositeArguments a);
+Results composite_vjp(VjpArguments<CompositeArguments> a);
+
 /// ends (C, P) int32: how many Gaussians up to each one have a row.
-Results count_rows(ProjectArguments a);
+Results count_rows(BatchArguments a);
 /// Writes rows, radii, ids.
 Results pack_rows(PackArguments a);
 Results pack_rows_vjp(PackVjpArguments a);

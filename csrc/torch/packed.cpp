@@ -81,7 +81,8 @@ struct SavedRows {
 
 }  // namespace
 
-Results count_rows(ProjectArguments a) {
+Results count_rows(BatchArguments arguments) {
+  ProjectArguments a = batch_of(arguments);
   const Pass pass(a, a.means3D);
   const int64_t cameras = check_cameras(a);
   const at::TensorOptions ints = a.means3D.options().dtype(at::kInt);
@@ -91,17 +92,17 @@ Results count_rows(ProjectArguments a) {
     check(in);
     check_values(in, false);
     if (c == 0) ends = at::empty({cameras, in.count()}, ints);
-    const Tensor radii = at::empty({in.count()}, ints);
-    make_backend(in.means3D)->project_rows(in, pass, RowTensors(), radii);
-    Tensor of_camera = ends[c];
-    at::cumsum_out(of_camera, radii.gt(0), 0, at::kInt);
+    ProjectedTensors counted;
+    counted.flags = ends[c];
+    make_backend(in.means3D)->project_rows(in, pass, {}, counted);
   }
-  return {cameras ? ends : at::zeros({0, a.count()}, ints)};
+  return {cameras ? ends.cumsum_(1) : at::zeros({0, a.count()}, ints)};
 }
 
 Results pack_rows(PackArguments a) {
   const Pass pass(a, a.means3D);
-  const int64_t cameras = check_cameras(a);
+  ProjectArguments batch = batch_of(a);
+  const int64_t cameras = check_cameras(batch);
   TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
   check_packed_rows(a.rows, a.means3D);
   const int64_t rows = a.rows.size(0);
@@ -110,7 +111,7 @@ Results pack_rows(PackArguments a) {
   check_ints(a.ends, "ends", at::kInt, {cameras, a.count()}, a.means3D);
   check_ints(a.firsts, "firsts", at::kLong, {cameras}, a.means3D);
   std::vector<Inputs> views;
-  for (int64_t c = 0; c < cameras; ++c) check(views.emplace_back(inputs_of(a, c)));
+  for (int64_t c = 0; c < cameras; ++c) check(views.emplace_back(inputs_of(batch, c)));
   for (int64_t c = 0; c < cameras; ++c) {
     const Inputs& in = views[c];
     make_backend(in.means3D)->pack_rows(in, pass, {a.rows, a.radii, a.ids, a.ends[c], a.firsts[c], a.first_id});
@@ -122,16 +123,17 @@ Results pack_rows(PackArguments a) {
 }
 
 Results pack_rows_vjp(PackVjpArguments a) {
-  const int64_t cameras = check_cameras(a), rows = a.ids.numel(), count = a.count();
+  ProjectArguments batch = batch_of(a);
+  const int64_t cameras = check_cameras(batch), rows = a.ids.numel(), count = a.count();
   check_packed_gradient(a.dL_drows, a.means3D);
   check_ints(a.ids, "ids", at::kInt, {a.dL_drows.size(0)}, a.means3D);
   check_ranges(a, cameras, rows);
   TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
-  RowTensors dL_drows;
+  ProjectedGrads dL_drows;
   dL_drows.packed = a.dL_drows;
-  return {gradients_of(a, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
-    const Tensor row_of = row_of_gaussians(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
-    return make_backend(in.means3D)->project_rows_vjp(in, row_of, dL_drows, grads);
+  return {gradients_of(batch, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+    dL_drows.rows = row_of_gaussians(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
+    return make_backend(in.means3D)->project_rows_vjp(in, dL_drows, grads);
   })};
 }
 

@@ -74,26 +74,36 @@ std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> ne
   check_needs(needs, kSceneTensors - 1);
   needs.insert(needs.begin() + 1, false);  // means2D
   check_camera_needs(needs, a.lens);
-  const int64_t cameras = a.viewmatrix.size(0);
-  Grads grads;
+  const int64_t cameras = a.viewmatrix.size(0), batches = a.means3D.dim() == 3 ? a.means3D.size(0) : 1;
+  Inputs all;
+  static_cast<SceneTensors<OptionalTensor>&>(all) = a;
+  const Grads sums = make_grads(all, needs);
+  // Those of several cameras that have coefficients of their own are added to zeros.
+  if (sums.shs.defined() && a.shs->dim() == 4 && cameras > batches && a.shs->size(0) == cameras) sums.shs.zero_();
   std::array<std::vector<Tensor>, kCameraTensors> of_cameras;
   for (int64_t c = 0; c < cameras; ++c) {
     Inputs in = inputs_of(a, c);
     check(in);
-    if (c == 0) grads = make_grads(in, needs);
-    grads.add = c > 0;
+    Grads grads = sums;
+    grads.means3D = part_of(a, c, sums.means3D, 2);
+    if (a.means3D.dim() == 3) grads.opacities = part_of(a, c, sums.opacities, 1);
+    grads.shs = part_of(a, c, sums.shs, 3);
+    grads.scales = part_of(a, c, sums.scales, 2);
+    grads.rotations = part_of(a, c, sums.rotations, 2);
+    grads.cov3D_precomp = part_of(a, c, sums.cov3D_precomp, 2);
+    grads.add = c % (cameras / batches) > 0;
     const Tensor camera = adjoint(c, in, grads);
     if (grads.with_camera) set_camera_grads(camera, needs, grads);
     const std::vector<Tensor> list = list_of(grads, in.means3D);
     for (size_t k = 0; k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
   }
-  const std::vector<Tensor> sums = list_of(grads, a.means3D);
+  const std::vector<Tensor> of_gaussians = list_of(sums, a.means3D);
   std::vector<Tensor> out;
-  ProjectArguments(a).each_tensor([&](std::string_view, const OptionalTensor& tensor) {
+  all.each_tensor([&](std::string_view, const OptionalTensor& tensor) {
     const size_t k = out.size();
     out.push_back(!needs[k] || !tensor   ? at::empty({0}, a.means3D.options())
                   : cameras == 0         ? at::zeros_like(*tensor)
-                  : k < kGaussianTensors ? sums[k]
+                  : k < kGaussianTensors ? of_gaussians[k]
                                          : at::stack(of_cameras[k - kGaussianTensors]));
   });
   out.erase(out.begin() + 1);  // means2D

@@ -22,8 +22,8 @@ void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads
 inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }
 std::vector<Tensor> list_of(Grads grads, const Tensor& like);
 
-/// Gradients with respect to the tensors of `project`, means2D not among them: summed over cameras for Gaussians, and
-/// stacked for cameras. `adjoint`: Backend::project_rows_vjp of one camera.
+/// Gradients with respect to the tensors of BatchArguments: summed over cameras for Gaussians, and stacked for cameras.
+/// `a`: after check_cameras(). `adjoint`: Backend::project_rows_vjp of one camera.
 std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint);
 

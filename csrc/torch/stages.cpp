@@ -1,5 +1,5 @@
-// The stages as separate ops, for one or several cameras: project, bin, blend, with adjoints. And footprint_weight.
-// They call a Backend (backend.h) camera by camera and return rows or lists camera after camera.
+// The stages after `project` as separate ops, for one or several cameras: bin, blend and its adjoint. And
+// footprint_weight. They call a Backend (backend.h) camera by camera, and return lists camera after camera.
 #include <ATen/ops/cat.h>
 #include <ATen/ops/full_like.h>
 #include <ATen/ops/stack.h>
@@ -25,17 +25,6 @@ Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
 
 Tensor join(const std::vector<Tensor>& parts) { return parts.size() == 1 ? parts[0] : at::cat(parts); }
 
-RowTensors make_rows(int64_t n, bool with_colors, const at::TensorOptions& options) {
-  RowTensors rows;
-  rows.means2d = at::empty({n, 2}, options);
-  rows.cov2d = at::empty({n, 3}, options);
-  rows.dets = at::empty({n}, options);
-  rows.opacities = at::empty({n}, options);
-  rows.depths = at::empty({n}, options);
-  rows.colors = at::empty({with_colors ? n : 0, 3}, options);
-  return rows;
-}
-
 struct CameraPart {
   ListTensors lists;
   RowTensors rows;
@@ -54,74 +43,6 @@ struct CameraPart {
 };
 
 }  // namespace
-
-Results project(ProjectArguments a) {
-  const Pass pass(a, a.means3D);
-  const int64_t cameras = check_cameras(a);
-  const bool with_colors = a.shs || a.colors_precomp;
-  const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
-  const Tensor row_splits = at::zeros({cameras + 1}, at::kLong);
-  int64_t* splits = row_splits.data_ptr<int64_t>();
-  std::array<std::vector<Tensor>, 9> parts;  // Per camera: the eight results that are rows, and dets.
-  const auto add = [&](const RowTensors& r, const Tensor& radii, const Tensor& ids, const Tensor& camera_ids) {
-    const Tensor rows[] = {r.means2d, r.cov2d, r.opacities, r.depths, r.colors, radii, ids, camera_ids, r.dets};
-    for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(rows[k]);
-  };
-  for (int64_t c = 0; c < cameras; ++c) {
-    Inputs in = inputs_of(a, c);
-    check(in);
-    check_values(in, false);
-    const std::unique_ptr<Backend> backend = make_backend(in.means3D);
-    RowTensors rows = make_rows(in.count(), with_colors, options);
-    const Tensor radii = at::empty({in.count()}, ints);
-    backend->project_rows(in, pass, rows, radii);
-    const Tensor kept = radii.gt(0).nonzero().select(1, 0), ids = kept.to(at::kInt);
-    splits[c + 1] = splits[c] + kept.size(0);
-    check_row_count(splits[c + 1], "means2d");
-    for (Tensor* t : rows.numbers()) *t = t->index_select(0, kept);
-    if (with_colors) rows.colors = rows.colors.index_select(0, kept);
-    add(rows, radii.index_select(0, kept), ids, at::full_like(ids, c));
-  }
-  if (cameras == 0) {
-    const Tensor none = at::empty({0}, ints);
-    add(make_rows(0, with_colors, options), none, none, none);
-  }
-  Results out;
-  for (size_t k = 0; k < 8; ++k) out.push_back(join(parts[k]));
-  out.push_back(row_splits);
-  // Clones, because results of an op must not share memory.
-  out.push_back(std::vector<Tensor>{join(parts[8]), out[6].toTensor().clone(), row_splits.clone()});
-  return out;
-}
-
-Results project_vjp(VjpArguments<ProjectArguments> arguments) {
-  const ProjectArguments& a = arguments.of_op;
-  const int64_t cameras = check_cameras(a);
-  TORCH_CHECK_VALUE(arguments.saved.size() == 3, "saved must be what project saved, got ", arguments.saved.size(),
-                    " tensors");
-  const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
-  const int64_t n = ids.numel(), count = a.count();
-  const bool are_splits = splits.device().is_cpu() && splits.scalar_type() == at::kLong && splits.dim() == 1 &&
-                          splits.size(0) == cameras + 1 && splits.is_contiguous() && rises_to(splits, n);
-  TORCH_CHECK_VALUE(are_splits && ids.dim() == 1 && ids.scalar_type() == at::kInt && may_be_rows_of(ids, count),
-                    "saved must be what project saved for the same arguments");
-  const auto options = a.means3D.options();
-  const auto gradient = [&](size_t output, const char* name, std::vector<int64_t> sizes) {
-    const Tensor given = gradient_of(arguments.dL_doutputs, output, name, a.means3D, sizes);
-    return given.defined() ? given : at::zeros(sizes, options);
-  };
-  RowTensors dL_drows;
-  dL_drows.means2d = gradient(0, "dL_dmeans2d", {n, 2});
-  dL_drows.cov2d = gradient(1, "dL_dcov2d", {n, 3});
-  dL_drows.opacities = gradient(2, "dL_dopacities", {n});
-  dL_drows.depths = gradient(3, "dL_ddepths", {n});
-  if (a.shs || a.colors_precomp) dL_drows.colors = gradient(4, "dL_dcolors", {n, 3});
-  return {gradients_of(a, arguments.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
-    const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
-    const Tensor rows = row_of_gaussians(ids.slice(0, first, last), count, first);
-    return make_backend(in.means3D)->project_rows_vjp(in, rows, dL_drows, grads);
-  })};
-}
 
 Results bin(BinArguments a) {
   Pass pass(a, a.means2d);

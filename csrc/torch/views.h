@@ -55,7 +55,6 @@ template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& g
   return out;
 }
 
-/// For reading or writing.
 template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows) {
   ProjectedRows<T> out;
   out.means2d = const_cast<Vec2<T>*>(const_pointer<Vec2<T>>(rows.means2d));
@@ -64,12 +63,43 @@ template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows)
   out.opacities = const_cast<T*>(const_pointer<T>(rows.opacities));
   out.depths = const_cast<T*>(const_pointer<T>(rows.depths));
   out.colors = const_cast<Vec3<T>*>(const_pointer<Vec3<T>>(rows.colors));
+  out.center = T(rows.center);
   return out;
 }
 
-template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const Tensor& rows, const RowTensors& dL_drows) {
+template <typename T> RowOutputs<T> row_outputs_of(const ProjectedTensors& rows) {
+  RowOutputs<T> out;
+  out.means2d = pointer<Vec2<T>>(rows.means2d);
+  out.cov2d = pointer<Sym2<T>>(rows.cov2d);
+  out.dets = pointer<T>(rows.dets);
+  out.opacities = pointer<T>(rows.opacities);
+  out.depths = pointer<T>(rows.depths);
+  out.center = T(rows.center);
+  out.features = pointer<T>(rows.features);
+  out.stride = rows.features.defined() ? rows.features.size(1) : 0;
+  out.colored = rows.colored;
+  out.shows_depth = rows.shows_depth;
+  out.radii = pointer<int32_t>(rows.radii);
+  out.conics = pointer<Vec3<T>>(rows.conics);
+  out.shown_opacities = pointer<T>(rows.shown_opacities);
+  out.gaussian_ids = pointer<int32_t>(rows.gaussian_ids);
+  out.camera_ids = pointer<int32_t>(rows.camera_ids);
+  out.camera = int32_t(rows.camera);
+  out.places.ends = const_pointer<int32_t>(rows.ends);
+  out.places.first = rows.first;
+  out.places.last = rows.last;
+  return out;
+}
+
+template <typename T> RowRules<T> row_rules_of(const RowRules<double>& rules) {
+  return {rules.order,       rules.shown,          rules.measured, T(rules.variance),
+          rules.compensated, T(rules.radius_clip), T(rules.near),  T(rules.far)};
+}
+
+template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const ProjectedGrads& dL_drows) {
   ProjectedRowGrads<T> out;
-  out.rows = const_pointer<int32_t>(rows);
+  out.places = {const_pointer<int32_t>(dL_drows.rows), const_pointer<int32_t>(dL_drows.ends),
+                const_pointer<int32_t>(dL_drows.radii), dL_drows.first, dL_drows.last};
   if (const T* packed = const_pointer<T>(dL_drows.packed)) {
     const int64_t stride = dL_drows.packed.size(1) * int64_t(sizeof(T));
     out.means2d = {reinterpret_cast<const Vec2<T>*>(packed + kPackedMean), stride};
@@ -82,7 +112,13 @@ template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const Tensor& 
   out.cov2d = const_pointer<Sym2<T>>(dL_drows.cov2d);
   out.opacities = const_pointer<T>(dL_drows.opacities);
   out.depths = const_pointer<T>(dL_drows.depths);
-  out.colors = const_pointer<Vec3<T>>(dL_drows.colors);
+  out.order = dL_drows.order;
+  out.shown = dL_drows.shown;
+  if (const T* features = const_pointer<T>(dL_drows.features)) {
+    const int64_t width = dL_drows.features.size(1), stride = width * int64_t(sizeof(T));
+    if (dL_drows.colored) out.colors = {reinterpret_cast<const Vec3<T>*>(features), stride};
+    if (dL_drows.shows_depth) out.shown_depths = {features + width - 1, stride};
+  }
   return out;
 }
 
@@ -99,13 +135,11 @@ template <typename T> PackedRows<T> packed_rows_of(const PackedTensors& packed) 
 }
 
 /// For `project` and `project_rows`.
-template <typename T, class Params>
-void set_projection(Params& p, const Inputs& in, const Pass& pass, const Tensor& radii) {
+template <typename T, class Params> void set_projection(Params& p, const Inputs& in, const Pass& pass) {
   p.camera = camera_of<T>(in);
   p.gaussians = gaussians_of<T>(in);
   p.footprint = pass.footprint.choice;
   p.bounds = cull_bounds<T>(pass.footprint.choice);
-  p.radii = pointer<int32_t>(radii);
 }
 /// For `project` alone.
 template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensors& channels) {
@@ -131,6 +165,7 @@ template <typename T>
 void set_shape_rows(ShapeRowsParams<T>& p, const RowTensors& rows, const Pass& pass, const Tensor& splats) {
   p.n = row_count(rows);
   p.rows = projected_rows_of<T>(rows);
+  p.any_color = rows.any_color;
   p.footprint = pass.footprint.choice;
   p.grid = pass.grid;
   p.splats = pointer<T>(splats);
@@ -152,6 +187,7 @@ void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pas
   p.dL_dcov2d = pointer<Sym2<T>>(dL_drows.cov2d);
   p.dL_dopacities = pointer<T>(dL_drows.opacities);
   p.absolute = pointer<Vec2<T>>(dL_drows.absolute);
+  p.dL_dcolors = pointer<Vec3<T>>(dL_drows.colors);
 }
 
 /// For `blend`, which writes `image` and `state`, and its adjoint, which reads them: there `image` is a gradient.

@@ -517,8 +517,11 @@ template <typename T> Rows<T> project_rows(const Footprint& f, const Scene<T>& s
   p.footprint = pass.footprint;
   p.bounds = cull_bounds<T>(pass.footprint);
   p.threads = 1;
-  p.radii = rows.radii.data();
-  p.rows = rows.view();
+  static_cast<ProjectedRows<T>&>(p.rows) = rows.view();  // a table
+  p.rows.features = &rows.colors[0].x;
+  p.rows.stride = 3;
+  p.rows.colored = true;
+  p.rows.radii = rows.radii.data();
   cpu::stages_of<T>(f.index).of(p.camera).project_rows(p);
   return rows;
 }
@@ -582,9 +585,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   const Rendered<double> expected = render(f, scene);
   Rows<double> rows = project_rows(f, scene);
   EXPECT_EQ(rows.radii, expected.radii);
-  for (size_t i = 0; i < rows.radii.size(); ++i) {
-    if (rows.radii[i] == 0) rows.dets[i] = -1;  // what is left undefined must not matter
-  }
+  for (size_t i = 0; i < rows.radii.size(); ++i) EXPECT_EQ(rows.dets[i] == -1, rows.radii[i] == 0);
   const auto& stages = cpu::stages_of<double>(f.index);
   const Lists<double> lists = bin_rows(f, rows, grid);
   const Channels<double> channels = channels_of<double>(lists, false, &rows.colors[0].x, 3, false);
@@ -603,7 +604,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   vjp.gaussians = scene.gaussians();
   vjp.grads = grads.views;
   vjp.threads = 1;
-  vjp.rows = {row_of.data(),       by_row.means2d.data(),
+  vjp.rows = {{row_of.data()},     by_row.means2d.data(),
               by_row.cov2d.data(), by_row.opacities.data(),
               dL_ddepths.data(),   reinterpret_cast<const Vec3<double>*>(sums.dL_dchannels.data())};
   stages.plain.project_rows_vjp(vjp);

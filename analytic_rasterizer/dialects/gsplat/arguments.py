@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -21,6 +22,13 @@ RASTERIZE_MODES = ("classic", "antialiased")
 """Filters of `rasterization`, where no footprint was chosen."""
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 """Cameras of `rasterization`; the first and the last may have coefficients of a lens."""
+
+LENS = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+"""Arguments that hold coefficients of lenses."""
+CAMERAS = ("viewmats", "Ks", *LENS)
+"""Arguments that describe cameras."""
+TENSORS = ("means", "quats", "scales", "opacities", "colors", "covars", "backgrounds", "extra_signals", *CAMERAS)
+"""Arguments that are tensors."""
 
 _RADIAL = {"pinhole": 6, "fisheye": 4}  # coefficients
 _NOT_CAMERAS = ("ftheta", "lidar")  # of gsplat
@@ -68,15 +76,54 @@ class Mode:
         return cls(render_mode.startswith("RGB"), bool(depth), depth.endswith("d"), depth.startswith("E"))
 
 
-def refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any, with_ut: bool, has_lens: bool) -> None:
+@dataclass(frozen=True)
+class Call:
+    """A call of `rasterization`, whose arguments are right.
+
+    Attributes:
+        given: The arguments by their names.
+        colors, extra: What Gaussians carry, or None.
+    """
+
+    given: SimpleNamespace
+    sizes: Sizes
+    mode: Mode
+    colors: Signal | None
+    extra: Signal | None
+    footprint: Footprint
+
+
+def checked(given: SimpleNamespace) -> Call:
+    """Raises what `rasterization` does for wrong arguments, before anything is rendered."""
+    g = given
+    refuse(g)
+    check_choice("render_mode", g.render_mode, RENDER_MODES)
+    check_choice("rasterize_mode", g.rasterize_mode, RASTERIZE_MODES)
+    check_numbers(g.width, g.height, g.near_plane, g.far_plane, g.radius_clip, g.eps2d)
+    sizes = check_scene(g.means, g.quats, g.scales, g.opacities, g.covars, g.viewmats, g.Ks)
+    check_lens(g, sizes)
+    colors = check_colors(g.means, sizes, g.colors, g.backgrounds, g.sh_degree, g.render_mode)
+    if g.return_normals and g.covars is not None:
+        raise ValueError("covars must be None where return_normals is True: normals are axes of quats")
+    mode = Mode.of(g.render_mode)
+    others = (colors.channels if colors is not None and mode.colors else 0) + mode.depth + 3 * bool(g.return_normals)
+    extra = check_extra(g.means, sizes, g.extra_signals, g.extra_signals_sh_degree, others)
+    if g.distributed:
+        check_distributed(sizes, colors=colors, extra_signals=extra)
+    return Call(g, sizes, mode, colors, extra, settle_footprint(g.footprint, g.rasterize_mode, g.eps2d))
+
+
+def refuse(given: SimpleNamespace) -> None:
     """Raises NotImplementedError for what gsplat renders and this package does not.
 
     `with_ut` is what gsplat demands for a lens. Here a lens needs no unscented transform, so that it may be asked for.
     """
-    for name, value in asked.items():
+    for name, why in _REFUSED.items():
+        value = getattr(given, name)
         if value is not None and value is not False:
-            raise NotImplementedError(f"{name} is not supported: {_REFUSED[name]}")
-    if with_ut and not (has_lens or camera_model == "fisheye"):
+            raise NotImplementedError(f"{name} is not supported: {why}")
+    camera_model, rolling_shutter = given.camera_model, given.rolling_shutter
+    if given.with_ut and camera_model != "fisheye" and all(getattr(given, name) is None for name in LENS):
         raise NotImplementedError(
             "with_ut is not supported: the unscented transform of 3DGUT is not implemented; with a lens it may be "
             "True, and the lens is exact"
@@ -90,17 +137,15 @@ def refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any, with_
     check_choice("camera_model", camera_model, CAMERA_MODELS)
 
 
-def check_lens(
-    means: torch.Tensor, sizes: Sizes, camera_model: str, radial: Any, tangential: Any, thin_prism: Any
-) -> None:
+def check_lens(given: SimpleNamespace, sizes: Sizes) -> None:
     """Raises for coefficients that are none of the camera's."""
-    given = {"radial_coeffs": radial, "tangential_coeffs": tangential, "thin_prism_coeffs": thin_prism}
-    for (name, tensor), count in zip(given.items(), (_RADIAL.get(camera_model), 2, 4)):
+    for name, count in zip(LENS, (_RADIAL.get(given.camera_model), 2, 4)):
+        tensor = getattr(given, name)
         if tensor is None:
             continue
-        if count is None:
-            raise ValueError(f"{name} must be None where camera_model is {camera_model!r}")
-        _check_tensor(name, tensor, means, (*sizes.batch, sizes.cameras, count))
+        if given.camera_model == "ortho":
+            raise ValueError(f"{name} must be None where camera_model is 'ortho'")
+        _check_tensor(name, tensor, given.means, (*sizes.batch, sizes.cameras, count))
 
 
 def check_distributed(sizes: Sizes, **signals: Signal | None) -> None:

@@ -1,35 +1,56 @@
-"""The cameras of gsplat's `rasterization` as settings of this package, lenses included."""
+"""The cameras of gsplat's `rasterization`, as the operators take them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import torch
 
+from ...arguments import camera_arguments
 from ...camera import camera_matrices
 from ...effects import Effects
 from ...footprints import Footprint
 from ...lens import SIZE, Lens
 from ...settings import GaussianRasterizationSettings
+from .arguments import LENS
 
 _LENSES = {"pinhole": "perspective", "fisheye": "fisheye"}  # by camera_model
 _BEFORE = (0, 6, 8)  # where radial, tangential and thin prism coefficients begin in both (csrc/core/camera/)
 
 
-def lens_coefficients(viewmats: torch.Tensor, camera_model: str, *given: torch.Tensor | None) -> torch.Tensor | None:
-    """(B * C, 12) coefficients of the cameras' lenses, in the order of `Lens`; None where there are no lenses.
+def flat_cameras(given: SimpleNamespace) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """(B * C, 4, 4) poses, (B * C, 3, 3) intrinsics and (B * C, 12) coefficients of lenses in the order of `Lens`.
 
-    Args:
-        given: Radial, tangential and thin prism coefficients (..., C, n), or None.
+    None for the latter where there are no lenses.
     """
-    if camera_model != "fisheye" and all(part is None for part in given):
-        return None
-    columns = list(viewmats.new_zeros(SIZE, math.prod(viewmats.shape[:-2])))
-    for part, first in zip(given, _BEFORE):
+    viewmats, intrinsics = (t if t.dim() == 3 else t.flatten(0, -3) for t in (given.viewmats, given.Ks))
+    parts = [getattr(given, name) for name in LENS]
+    if given.camera_model != "fisheye" and all(part is None for part in parts):
+        return viewmats, intrinsics, None
+    columns = list(viewmats.new_zeros(SIZE, len(viewmats)))
+    for part, first in zip(parts, _BEFORE):
         if part is not None:
             columns[first : first + part.shape[-1]] = part.reshape(-1, part.shape[-1]).unbind(1)
-    return torch.stack(columns, 1)
+    return viewmats, intrinsics, torch.stack(columns, 1)
+
+
+def prepared_cameras(viewmats, Ks, coefficients, width, height, camera_model, near, far) -> dict[str, torch.Tensor]:
+    from ...footprints import resolve_footprint
+
+    settings = settings_of(
+        viewmats,
+        Ks,
+        width,
+        height,
+        near=near,
+        far=far,
+        camera_model=camera_model,
+        coefficients=coefficients,
+        footprint=resolve_footprint("point"),
+    )
+    args = [camera_arguments(s, viewmats, None, full=True) for s in settings]
+    return {n: torch.stack([a[n] for a in args]) for n in ("viewmatrix", "projmatrix", "campos", "lens")}
 
 
 def settings_of(

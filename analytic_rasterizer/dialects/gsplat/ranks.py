@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+import math
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -14,7 +15,9 @@ from torch.autograd.function import once_differentiable
 from ...distributed.agreement import REQUIREMENTS, agree, facts_of, gather, place_in
 from ...distributed.cameras import summary_of
 from ...distributed.exchange import Route, exchange
-from ...stages import Splats
+from ...stages import ROWS, Splats
+from .arguments import CAMERAS, LENS, TENSORS, Call, Sizes, checked
+from .scene import Scene
 
 _REQUIREMENTS = REQUIREMENTS | {
     "kind": "means must have one dtype and one kind of device on every rank",
@@ -23,7 +26,8 @@ _REQUIREMENTS = REQUIREMENTS | {
     "moving": None,
 }
 
-Checked = TypeVar("Checked")
+_SIGNALS = ("colors", "extra_signals")
+_NOT_COMPARED = ("footprint", "renderer_config", "tile_size", "channel_chunk", "segmented")  # arguments of ranks
 
 
 @dataclass(frozen=True)
@@ -46,38 +50,33 @@ class Sharing:
     moving: bool
 
     @classmethod
-    def agreed(
-        cls, check: Callable[[], Checked], tensors: dict[str, Any], settings: tuple
-    ) -> tuple[Checked, Sharing | None]:
-        """What `check` returns, and the ranks; None for the latter where this process is alone.
-
-        Args:
-            check: Raises for wrong arguments, which then raises on every rank. The last of what it returns, the
-                footprint, must be the same on every rank too.
-            tensors: Arguments of `rasterization` that may require gradients; not looked at before `check` has passed.
-            settings: Its other arguments.
-        """
+    def agreed(cls, given: SimpleNamespace) -> tuple[Call, Sharing | None]:
+        """The call, after checking its arguments on all ranks: wrong ones of one rank raise on every rank. And the
+        ranks; None where this process is alone."""
         rank, world = place_in(None)
         if world == 1:
-            return check(), None
+            return checked(given), None
 
-        def make() -> tuple[Checked, dict[str, int], None]:
-            checked = check()
-            given = [t for t in tensors.values() if t is not None]
-            digest = hashlib.blake2b(repr((settings, str(checked[-1]))).encode(), digest_size=8).digest()
-            names = ("viewmats", "Ks", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
-            cameras = [tensors[name] for name in names if tensors[name] is not None]
-            facts = facts_of(tensors["means"], given, None, "means") | {
-                "cameras": len(tensors["viewmats"]),
+        def make() -> tuple[Call, dict[str, int], None]:
+            call = checked(given)
+            tensors = {name: getattr(given, name) for name in TENSORS}
+            others = {name: value for name, value in vars(given).items() if name not in (*TENSORS, *_NOT_COMPARED)}
+            others["widths"] = [None if tensors[name] is None else tensors[name].shape[-1] for name in _SIGNALS]
+            others["absent"] = [name for name in LENS if tensors[name] is None]
+            digest = hashlib.blake2b(repr((others, str(call.footprint))).encode(), digest_size=8).digest()
+            differentiable = [t for name, t in tensors.items() if t is not None and name != "backgrounds"]
+            cameras = [tensors[name] for name in CAMERAS if tensors[name] is not None]
+            facts = facts_of(given.means, differentiable, None, "means") | {
+                "cameras": call.sizes.cameras,
                 "settings": int.from_bytes(digest, "little", signed=True),
                 "moving": int(torch.is_grad_enabled() and any(t.requires_grad for t in cameras)),
             }
-            return checked, facts, None
+            return call, facts, None
 
-        checked, (facts, _) = agree(make, _REQUIREMENTS, None)
+        call, (facts, _) = agree(make, _REQUIREMENTS, None)
         first_id, _, join = summary_of(facts, rank)
         moving = any(of_rank["moving"] for of_rank in facts)
-        return checked, cls(rank, world, facts[0]["cameras"], first_id, join, moving)
+        return call, cls(rank, world, facts[0]["cameras"], first_id, join, moving)
 
     def all_cameras(
         self, viewmats: torch.Tensor, Ks: torch.Tensor, coefficients: torch.Tensor | None
@@ -90,25 +89,57 @@ class Sharing:
         views, intrinsics, of_lens = every.split([16, 9, of_lens.shape[1]], 1)
         return views.reshape(-1, 4, 4), intrinsics.reshape(-1, 3, 3), None if coefficients is None else of_lens
 
+    @staticmethod
+    def as_table(rows: dict[str, torch.Tensor], sizes: Sizes) -> dict[str, torch.Tensor]:
+        """Packed rows as the table (C, N, ...) of `meta`, zero where there is no row."""
+        shape, places = (sizes.cameras, sizes.gaussians), _places(rows, sizes)
+        table = {}
+        for name in ("radii", "means2d", "depths", "conics", "opacities", "shown_opacities"):
+            values = rows[name]
+            if len(values) == len(places):
+                empty = values.new_zeros(math.prod(shape), *values.shape[1:])
+                values = empty.index_copy(0, places, values).reshape(*shape, *values.shape[1:])
+            table[name] = values
+        return table
+
     def send(
-        self, splats: Splats, features: torch.Tensor, absolute: torch.Tensor | None
-    ) -> tuple[Splats, torch.Tensor | None]:
-        """The splats of all ranks for the cameras of this one, with features in place of colors, and global ids.
+        self, rows: dict[str, torch.Tensor], means2d: torch.Tensor, absolute: torch.Tensor | None, scene: Scene
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+        """The rows of all ranks for the cameras of this one, by the names of `composite`.
 
         Args:
-            splats: Of the Gaussians of this rank in the cameras of all ranks.
-            features: (R, D), a row per splat; D may be 0.
-            absolute: (R, 2) or None, what takes the absolute gradients.
+            rows: Of the Gaussians of this rank in the cameras of all ranks.
+            means2d: (R, 2) of the rows, or (C, N, 2) of their table.
+            absolute: Likewise, what takes the absolute gradients; or None.
 
         Returns:
-            The splats, and what takes the absolute gradients of all of them.
+            The rows, and what takes the absolute gradients of all of them.
         """
-        counts = gather(splats.row_splits.diff().tolist(), self.world, None)
+        counts = gather(rows["row_splits"].diff().tolist(), self.world, None)
         owned = [list(range(r * self.cameras, (r + 1) * self.cameras)) for r in range(self.world)]
         route = Route(counts, owned, self.rank, None)
+        if means2d.dim() > 2:
+            places = _places(rows, scene.sizes)
+            means2d, absolute = (
+                None if t is None else t.flatten(0, 1).index_select(0, places) for t in (means2d, absolute)
+            )
+        splats = Splats(
+            **{name: rows[name] for name in ROWS if name not in ("means2d", "colors")},
+            means2d=means2d,
+            colors=rows["features"],
+            width=scene.width,
+            height=scene.height,
+            footprint=scene.footprint.key,
+            option=scene.footprint.option,
+        )
         of_means = [] if absolute is None else [absolute]
-        own, of_own_means, _ = exchange(route, [replace(splats, colors=features)], of_means, self.first_id, self.join)
-        return own, of_own_means
+        own, absolute, _ = exchange(route, [splats], of_means, self.first_id, self.join)
+        return {name: getattr(own, name) for name in ROWS} | {"features": own.colors}, absolute
+
+
+def _places(rows: dict[str, torch.Tensor], sizes: Sizes) -> torch.Tensor:
+    """(R,) int64, where in the flattened table each packed row is."""
+    return rows["camera_ids"].long() * sizes.gaussians + rows["gaussian_ids"].long()
 
 
 class _AllCameras(torch.autograd.Function):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -11,29 +12,12 @@ import torch
 from ..._C import TILE
 from ...autocast import widened
 from ...footprints import Footprint
-from ...stages import Splats, blend, list_tiles
-from .arguments import (
-    RASTERIZE_MODES,
-    RENDER_MODES,
-    Mode,
-    Signal,
-    Sizes,
-    check_choice,
-    check_colors,
-    check_distributed,
-    check_extra,
-    check_lens,
-    check_numbers,
-    check_scene,
-    refuse,
-    settle_footprint,
-)
-from .cameras import lens_coefficients, settings_of
-from .meta import KeepAbsolute, Layout, measure, without_culled
+from .arguments import RASTERIZE_MODES, RENDER_MODES, TENSORS, Call, checked
+from .cameras import flat_cameras, prepared_cameras
 from .ranks import Sharing
-from .scene import Scene
+from .scene import KeepAbsolute, Scene, composite, named, upper_triangle
 
-_SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
+__all__ = ["RASTERIZE_MODES", "RENDER_MODES", "rasterization", "upper_triangle"]
 
 
 def rasterization(
@@ -162,134 +146,35 @@ def rasterization(
             everywhere.
         RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
     """
-    means, quats, scales, opacities, covars = map(widened, (means, quats, scales, opacities, covars))
-    colors, viewmats, Ks, backgrounds, extra_signals = map(widened, (colors, viewmats, Ks, backgrounds, extra_signals))
-    lens = tuple(map(widened, (radial_coeffs, tangential_coeffs, thin_prism_coeffs)))
-    asked = {
-        "sparse_grad": sparse_grad,
-        "with_eval3d": with_eval3d,
-        "rays": rays,
-        "ftheta_coeffs": ftheta_coeffs,
-        "lidar_coeffs": lidar_coeffs,
-        "external_distortion_coeffs": external_distortion_coeffs,
-        "viewmats_rs": viewmats_rs,
-        "ut_params": ut_params,
-    }
-    has_lens = any(part is not None for part in lens)
-
-    def check() -> tuple[Sizes, Signal | None, Signal | None, Footprint]:
-        refuse(asked, camera_model, rolling_shutter, with_ut, has_lens)
-        check_choice("render_mode", render_mode, RENDER_MODES)
-        check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-        check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
-        sizes = check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
-        check_lens(means, sizes, camera_model, *lens)
-        signal = check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
-        if return_normals and covars is not None:
-            raise ValueError("covars must be None where return_normals is True: normals are axes of quats")
-        mode = Mode.of(render_mode)
-        others = (signal.channels if signal is not None and mode.colors else 0) + mode.depth + 3 * bool(return_normals)
-        extra = check_extra(means, sizes, extra_signals, extra_signals_sh_degree, others)
-        if distributed:
-            check_distributed(sizes, colors=signal, extra_signals=extra)
-        return sizes, signal, extra, settle_footprint(footprint, rasterize_mode, eps2d)
-
-    sharing = None
-    if distributed:
-        tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-        tensors |= {"viewmats": viewmats, "Ks": Ks, "covars": covars, "extra_signals": extra_signals}
-        tensors |= dict(zip(("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"), lens))
-        numbers = (width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode, absgrad)
-        channels = [t.shape[-1] if isinstance(t, torch.Tensor) and t.dim() else None for t in (colors, extra_signals)]
-        chosen = (
-            rasterize_mode,
-            camera_model,
-            *channels,
-            extra_signals_sh_degree,
-            bool(return_normals),
-            global_z_order,
-        )
-        chosen += tuple(part is None for part in lens)
-        (own_sizes, signal, extra, settled), sharing = Sharing.agreed(check, tensors, (*numbers, *chosen))
-    else:
-        own_sizes, signal, extra, settled = check()
-    sizes = own_sizes
-    coefficients = lens_coefficients(viewmats, camera_model, *lens)
-    if sharing is not None:
-        viewmats, Ks, coefficients = sharing.all_cameras(viewmats, Ks, coefficients)
-        sizes = dataclasses.replace(own_sizes, cameras=len(viewmats))
-    width, height = int(width), int(height)
-    mode, by_z = Mode.of(render_mode), bool(global_z_order)
-    # `project` cuts a fisheye by the distance.
-    planes = (near_plane, far_plane) if camera_model == "fisheye" and by_z else None
-    settings = settings_of(
-        viewmats,
-        Ks,
-        width,
-        height,
-        near=near_plane,
-        far=far_plane if planes is None else math.inf,
-        camera_model=camera_model,
-        coefficients=coefficients,
-        footprint=settled,
-    )
-    if covars is None:
-        covariances = {"scales": scales, "rotations": quats}
-    else:
-        covariances = {"cov3D_precomp": upper_triangle(covars)}
-    gaussians = {"means3D": means, "opacities": opacities, **covariances}
-    scene = Scene(sizes, gaussians, viewmats, settings, camera_model, by_z)
-    splats = scene.ordered(scene.project(signal if mode.colors and sh_degree is not None else None))
-    measures = measure(splats, settled, radius_clip, planes)
-    if packed:
-        splats, measures = without_culled(splats, measures)
-    else:
-        splats = dataclasses.replace(splats, opacities=torch.where(measures.drawn, splats.opacities, 0))
-    layout = Layout.of(splats, sizes, packed)
-
-    means2d = layout.to_meta(splats.means2d + 0.5)
-    through, absolute = means2d, None
+    given = SimpleNamespace(**{name: widened(v) if name in TENSORS else v for name, v in locals().items()})
+    call, sharing = Sharing.agreed(given) if distributed else (checked(given), None)
+    mode = call.mode
+    scene = _scene(call, sharing)
+    rows, channels = scene.rows(mode, call.colors, call.extra, bool(return_normals), packed or sharing is not None)
+    held = rows if packed or sharing is None else sharing.as_table(rows, scene.sizes)
+    means2d, absolute = held["means2d"], None
     if absgrad and means2d.requires_grad:
-        through, absolute = KeepAbsolute.apply(means2d)
-        absolute = layout.to_rows(absolute)
-    splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
-
-    features = scene.features(splats, mode, signal, extra, bool(return_normals))
-    channels = {name: rows.shape[1] for name, rows in features.items()}
-    rows = torch.cat(list(features.values()), 1) if len(features) > 1 else next(iter(features.values()))
-    blended = splats
-    if sharing is not None:
-        blended, absolute = sharing.send(splats, rows, absolute)
-        rows = blended.colors  # of any number of channels, which `list_tiles` does not take
-        blended = dataclasses.replace(blended, colors=rows.new_empty(0, 3))
-    background = None
-    if backgrounds is not None and mode.colors:  # there is none behind the other channels
-        background = torch.nn.functional.pad(backgrounds.flatten(0, -2), (0, rows.shape[1] - channels["colors"]))
-    images, alphas = _blend(blended, rows, background, absolute)
-    dims = (*sizes.batch, own_sizes.cameras)
-    images, alphas = images.unflatten(0, dims), alphas.unflatten(0, dims)
-    made = dict(zip(channels, images.split(list(channels.values()), -1)))
-    if mode.expected:
-        made["depth"] = made["depth"] / alphas.clamp(min=_SMALLEST_ALPHA)
-    if mode.expected or not made.keys() <= {"colors", "depth"}:
+        means2d, absolute = KeepAbsolute.apply(means2d)
+    if sharing is None:
+        rows = rows | {"means2d": means2d}
+    else:
+        rows, absolute = sharing.send(rows, means2d, absolute, scene)
+    background = given.backgrounds if mode.colors else None  # there is none behind the other channels
+    images, alphas = composite(rows, scene, background, absolute, mode.expected)
+    made = {}
+    if call.sizes.batch:
+        images, alphas = (t.unflatten(0, (*call.sizes.batch, call.sizes.cameras)) for t in (images, alphas))
+    if not channels.keys() <= {"colors", "depth"}:
+        made = dict(zip(channels, images.split(list(channels.values()), -1)))
         images = torch.cat([made[name] for name in ("colors", "depth") if name in made], -1)
-
-    meta = {
-        "batch_ids": splats.camera_ids.long() // sizes.cameras if packed else None,
-        "camera_ids": splats.camera_ids.long() % sizes.cameras if packed else None,
-        "gaussian_ids": splats.gaussian_ids.long() if packed else None,
-        "radii": layout.to_meta(measures.radii),
-        "means2d": means2d,
-        "depths": layout.to_meta(splats.depths),
-        "conics": layout.to_meta(measures.conics),
-        "opacities": layout.to_meta(measures.opacities),
-        "width": width,
-        "height": height,
+    meta = named(held, scene.sizes, packed) | {
+        "width": scene.width,
+        "height": scene.height,
         "tile_size": TILE,
-        "tile_width": math.ceil(width / TILE),
-        "tile_height": math.ceil(height / TILE),
-        "n_batches": math.prod(sizes.batch),
-        "n_cameras": own_sizes.cameras,
+        "tile_width": math.ceil(scene.width / TILE),
+        "tile_height": math.ceil(scene.height / TILE),
+        "n_batches": math.prod(call.sizes.batch),
+        "n_cameras": call.sizes.cameras,
     }
     for key, name in (("render_extra_signals", "extra"), ("normals", "normals")):
         if name in made:
@@ -297,15 +182,34 @@ def rasterization(
     return images, alphas, meta
 
 
-def upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
-    """(..., 6) of (..., 3, 3)."""
-    return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
-
-
-def _blend(
-    splats: Splats, features: torch.Tensor, backgrounds: torch.Tensor | None, absolute: torch.Tensor | None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images (B * C, H, W, K) and alphas (B * C, H, W, 1)."""
-    lists = list_tiles(splats, keep=torch.is_grad_enabled())
-    images, alphas = blend(splats, lists, features, backgrounds, means2d_abs=absolute)
-    return images.permute(0, 2, 3, 1).contiguous(), alphas.permute(0, 2, 3, 1).contiguous()
+def _scene(call: Call, sharing: Sharing | None) -> Scene:
+    """What is rendered: the cameras of all ranks, where there are several."""
+    given, sizes = call.given, call.sizes
+    viewmats, intrinsics, coefficients = flat_cameras(given)
+    if sharing is not None:
+        viewmats, intrinsics, coefficients = sharing.all_cameras(viewmats, intrinsics, coefficients)
+        sizes = dataclasses.replace(sizes, cameras=len(viewmats))
+    width, height, by_z = int(given.width), int(given.height), bool(given.global_z_order)
+    # `project` cuts a fisheye by the distance.
+    cut_later = given.camera_model == "fisheye" and by_z
+    planes = given.near_plane, given.far_plane
+    far = math.inf if cut_later else given.far_plane
+    cameras = prepared_cameras(
+        viewmats, intrinsics, coefficients, width, height, given.camera_model, given.near_plane, far
+    )
+    if given.covars is None:
+        covariances = {"scales": given.scales, "rotations": given.quats}
+    else:
+        covariances = {"cov3D_precomp": upper_triangle(given.covars)}
+    return Scene(
+        sizes=sizes,
+        gaussians={"means3D": given.means, "opacities": given.opacities, **covariances},
+        cameras=cameras,
+        width=width,
+        height=height,
+        camera_model=given.camera_model,
+        by_z=by_z,
+        planes=planes if cut_later else (-math.inf, math.inf),
+        radius_clip=given.radius_clip,
+        footprint=call.footprint,
+    )

@@ -1,20 +1,26 @@
-"""The Gaussians of gsplat's `rasterization` in its cameras: their splats, and what each carries into the images."""
+"""What the two operators of gsplat's `rasterization` are given: `project`, Gaussians and cameras to rows, and
+`composite`, rows to images (csrc/torch/)."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
+from ...footprints import Footprint
+from ...ops import Op
 from ...rotations import rotation_matrices
-from ...settings import GaussianRasterizationSettings
-from ...stages import Splats, project
 from .arguments import Mode, Signal, Sizes
-from .meta import ROWS
 
 _AT_ONCE = 3  # channels of harmonics that `project` evaluates
+_CENTER = 0.5  # px, where gsplat has the centre of the first pixel
+_NAMES = ("means2d", "cov2d", "opacities", "depths", "features", "radii", "gaussian_ids", "camera_ids", "row_splits")
+_NAMES += ("dets", "conics", "shown_opacities")  # of the results of `project`, in order
+_project, _composite = Op("project"), Op("composite")
 
 
 @dataclass(frozen=True)
@@ -23,139 +29,210 @@ class Scene:
 
     Attributes:
         gaussians: Arguments of `project` by their names, with leading dimensions.
-        viewmats: (..., C, 4, 4).
-        settings: One per camera.
+        cameras: viewmatrix, projmatrix, campos and lens of all cameras, as `prepare_cameras` returns them.
+        width, height: Of the images, px.
         camera_model: One of `CAMERA_MODELS`.
         by_z: Whether splats are drawn in the order of z, and not of the distance.
+        planes: Between which depths splats are drawn, where `project` has not looked at it.
+        radius_clip: As in `rasterization`.
     """
 
     sizes: Sizes
     gaussians: dict[str, torch.Tensor]
-    viewmats: torch.Tensor
-    settings: list[GaussianRasterizationSettings]
+    cameras: dict[str, torch.Tensor]
+    width: int
+    height: int
     camera_model: str
     by_z: bool
+    planes: tuple[float, float]
+    radius_clip: float
+    footprint: Footprint
 
-    def project(self, shs: Signal | None) -> Splats:
-        """Splats of all Gaussians in all cameras, with colours where there are harmonics of three channels.
-
-        One `project` serves the cameras that see the same Gaussians: those of a batch index, unless harmonics are per
-        camera.
-        """
-        dims = len(self.sizes.batch)
-        flat = {name: _table(value, value.dim() - dims) for name, value in self.gaussians.items()}
-        settings, per_camera = self.settings, shs is not None and shs.per_camera
-        if shs is not None:
-            harmonics = _table(shs.values, 3)
-            settings = [s._replace(sh_degree=shs.degree) for s in settings]
-        together = 1 if per_camera else self.sizes.cameras
-        parts = []
-        for first in range(0, len(settings), together):
-            batch = first // self.sizes.cameras
-            of_batch = {name: value[batch] for name, value in flat.items()}
-            if shs is not None:
-                of_batch["shs"] = harmonics[first if per_camera else batch]
-            parts.append(project(settings[first : first + together], **of_batch))
-        return _join(parts)
-
-    def ordered(self, splats: Splats) -> Splats:
-        """The splats with the depths by which they are drawn. `project` gives those of the camera model."""
-        if self.by_z != (self.camera_model == "fisheye"):
-            return splats
-        return dataclasses.replace(splats, depths=self.depths(splats, not self.by_z).clamp(min=0))
-
-    def depths(self, splats: Splats, distance: bool) -> torch.Tensor:
-        """(R,) camera-space z of the splats' means, or their distance from the camera, world units. Differentiable."""
-        parts = []
-        for view, means in zip(self.viewmats.reshape(-1, 4, 4), self._by_camera(splats, self.gaussians["means3D"])):
-            axes = view[:3] if distance else view[2:3]
-            of_camera = (means[:, None] * axes[:, :3]).sum(-1) + axes[:, 3]
-            parts.append(of_camera.norm(dim=1) if distance else of_camera[:, 0])
-        return torch.cat(parts)
-
-    def features(
-        self, splats: Splats, mode: Mode, colors: Signal | None, extra: Signal | None, normals: bool
-    ) -> dict[str, torch.Tensor]:
-        """(R, D) by what they are, in the order of the channels: "colors", "extra", "normals", "depth"."""
-        made = {}
+    def rows(
+        self, mode: Mode, colors: Signal | None, extra: Signal | None, normals: bool, packed: bool
+    ) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
+        """The rows that `composite` takes, and the numbers of their features: "colors", "extra", "normals", "depth"."""
+        given, channels, harmonics = [], {}, None
         if mode.colors:
-            made["colors"] = splats.colors if colors.degree is not None else self._values(splats, colors)
+            channels["colors"] = colors.channels
+            harmonics = colors if colors.degree is not None else None
+            given += [] if harmonics else [colors]
         if extra is not None:
-            made["extra"] = self._values(splats, extra) if extra.degree is None else self._harmonics(splats, extra)
+            channels["extra"] = extra.channels
+            given.append(extra if extra.degree is None else self._harmonics(extra))
         if normals:
-            made["normals"] = self._normals(splats)
+            channels["normals"] = 3
+            given.append(self._normals())
         if mode.depth:
-            distance = mode.distance and self.camera_model != "ortho"  # whose rays go along z
-            as_drawn = not mode.distance or distance != self.by_z
-            made["depth"] = (splats.depths if as_drawn else self.depths(splats, distance))[:, None]
-        return made
+            channels["depth"] = 1
+        return self.project(harmonics, self._joined(given), self._shown(mode), packed), channels
 
-    def _values(self, splats: Splats, signal: Signal) -> torch.Tensor:
-        """(R, D) of a signal without harmonics."""
-        table = splats.camera_ids.long()
-        if not signal.per_camera:
-            table = table // self.sizes.cameras
-        rows = table * self.sizes.gaussians + splats.gaussian_ids.long()
-        return signal.values.flatten(0, -2).index_select(0, rows)
+    def project(
+        self, shs: Signal | None, values: torch.Tensor | None, shown: str, packed: bool
+    ) -> dict[str, torch.Tensor]:
+        """Results of the operator, by name. A table has the sizes (..., C, N)."""
+        dims, count = len(self.sizes.batch), math.prod(self.sizes.batch) * self.sizes.cameras
+        flat = {name: flattened(value, value.dim() - dims) for name, value in self.gaussians.items()}
+        results = _project(
+            **{name: flat.get(name) for name in ("means3D", "opacities", "scales", "rotations", "cov3D_precomp")},
+            shs=None if shs is None else self._by_group(shs, 3),
+            colors_precomp=None,
+            values=values,
+            **self.cameras,
+            image_height=self.height,
+            image_width=self.width,
+            tanfovx=[1.0] * count,  # the lenses have them
+            tanfovy=[1.0] * count,
+            scale_modifier=1.0,
+            sh_degree=0 if shs is None else shs.degree,
+            footprint=self.footprint.key,
+            option=self.footprint.option,
+            table=[] if packed else [*self.sizes.batch, self.sizes.cameras, self.sizes.gaussians],
+            measured=True,
+            order="z" if self.by_z else "distance",
+            shown=shown,
+            center=_CENTER,
+            near=self.planes[0],
+            far=self.planes[1],
+            radius_clip=self.radius_clip,
+        )
+        return dict(zip(_NAMES, results))
 
-    def _harmonics(self, splats: Splats, signal: Signal) -> torch.Tensor:
-        """(R, D) sums of harmonics plus 1/2, which colours clamp at zero and extra signals do not.
+    def _shown(self, mode: Mode) -> str:
+        """The kind of depth that is rendered."""
+        if not mode.depth:
+            return "none"
+        distance = mode.distance and self.camera_model != "ortho"  # whose rays go along z
+        return "distance" if distance or not (mode.distance or self.by_z) else "z"
+
+    def _by_group(self, signal: Signal, dims: int) -> torch.Tensor:
+        """Values with one dimension before the last `dims`, for batch indices or cameras; without, where all share
+        them."""
+        if signal.values.dim() == dims:
+            return signal.values
+        return flattened(signal.values, dims)
+
+    def _joined(self, given: list[Signal]) -> torch.Tensor | None:
+        """The values of signals without harmonics beside each other."""
+        parts = [self._by_group(signal, 2) for signal in given]
+        if len(parts) < 2:
+            return parts[0] if parts else None
+        if len({part.shape[:-1] for part in parts}) > 1:  # some are per camera
+            dims, cameras = len(self.sizes.batch), self.sizes.cameras
+            parts = [
+                (s.values if s.per_camera else s.values.unsqueeze(dims).expand(*s.values.shape[:dims], cameras, -1, -1))
+                .flatten(0, dims)
+                for s in given
+            ]  # fmt: skip
+        return torch.cat(parts, -1)
+
+    def _harmonics(self, signal: Signal) -> Signal:
+        """(..., C, N, D) sums of harmonics plus 1/2, which colours clamp at zero and extra signals do not.
 
         They are put together from colours, so that the harmonics are those of csrc/core/sh.h: where a colour is
         clamped, its value is 1 minus the colour of the negated coefficients. Gaussians whose coefficients are not
-        finite are missing among the colours; they get NaN.
+        finite have no row; they get NaN.
         """
-        keys, parts = self._keys(splats), []
+        parts = []
         for values in signal.values.split(_AT_ONCE, -1):
             count = values.shape[-1]
-            values = torch.nn.functional.pad(values, (0, _AT_ONCE - count))
-            above, below = (self.project(dataclasses.replace(signal, values=v)) for v in (values, -values))
-            sums = torch.where(above.colors > 0, above.colors, 1 - below.colors)[:, :count]
-            found, last = self._keys(above), len(sums)
-            places = torch.searchsorted(found, keys)
-            there = torch.nn.functional.pad(found, (0, 1), value=-1)[places] == keys
-            with_missing = torch.cat([sums, sums.new_full((1, count), torch.nan)])
-            parts.append(with_missing.index_select(0, torch.where(there, places, last)))
-        return torch.cat(parts, 1)
+            values = functional.pad(values, (0, _AT_ONCE - count))
+            above, below = (
+                self.project(Signal(v, signal.degree, signal.per_camera), None, "none", packed=False)
+                for v in (values, -values)
+            )
+            sums = torch.where(above["features"] > 0, above["features"], 1 - below["features"])[:, :count]
+            found = above["radii"].reshape(-1, 2)[:, :1] > 0
+            parts.append(torch.where(found, sums, torch.nan))
+        return self._per_camera(torch.cat(parts, 1))
 
-    def _normals(self, splats: Splats) -> torch.Tensor:
-        """(R, 3) third axes of the Gaussians in the world; of the two opposite ones that which faces the camera."""
-        axes = self._by_camera(splats, rotation_matrices(self.gaussians["rotations"])[..., 2])
-        means = self._by_camera(splats, self.gaussians["means3D"].detach())
-        parts = []
-        for settings, normals, positions in zip(self.settings, axes, means):
-            if self.camera_model == "ortho":
-                rays = settings.viewmatrix.detach()[:3, 2]
-            else:
-                rays = positions - settings.campos.detach()
-            parts.append(torch.where((normals * rays).sum(1, keepdim=True) > 0, -normals, normals))
-        return torch.cat(parts)
+    def _normals(self) -> Signal:
+        """(..., C, N, 3) third axes of the Gaussians in the world; of the two opposite ones that which faces the
+        camera."""
+        axes = rotation_matrices(self.gaussians["rotations"])[..., 2].unsqueeze(-3)
+        if self.camera_model == "ortho":
+            rays = self.cameras["viewmatrix"].detach()[:, None, :3, 2]
+            rays = rays.unflatten(0, (*self.sizes.batch, self.sizes.cameras))
+        else:
+            positions = self.cameras["campos"].detach()[:, None].unflatten(0, (*self.sizes.batch, self.sizes.cameras))
+            rays = self.gaussians["means3D"].detach().unsqueeze(-3) - positions
+        facing = (axes * rays).sum(-1, keepdim=True) > 0
+        return Signal(torch.where(facing, -axes, axes), None, True)
 
-    def _keys(self, splats: Splats) -> torch.Tensor:
-        """(R,) ascending, one number for each camera and Gaussian."""
-        return splats.camera_ids.long() * self.sizes.gaussians + splats.gaussian_ids.long()
-
-    def _by_camera(self, splats: Splats, values: torch.Tensor) -> list[torch.Tensor]:
-        """The splats' rows of (..., N, D), for each camera. Each is there once, so that gradients have one order."""
-        flat = _table(values, 2)
-        ids = splats.gaussian_ids.long().split(splats.row_splits.diff().tolist())
-        return [flat[camera // self.sizes.cameras].index_select(0, rows) for camera, rows in enumerate(ids)]
+    def _per_camera(self, rows: torch.Tensor) -> Signal:
+        """Rows of a table as a signal."""
+        return Signal(
+            rows.unflatten(0, (*self.sizes.batch, self.sizes.cameras, self.sizes.gaussians)), None, per_camera=True
+        )
 
 
-def _table(values: torch.Tensor, dims: int) -> torch.Tensor:
-    """All but the last dimensions in one, which may be a product of none."""
-    return values.reshape(math.prod(values.shape[:-dims]), *values.shape[-dims:])
+def composite(
+    rows: dict[str, torch.Tensor],
+    scene: Scene,
+    background: torch.Tensor | None,
+    means2d_abs: torch.Tensor | None,
+    expected: bool,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (B * C, H, W, K) and alphas (B * C, H, W, 1) of rows.
+
+    Args:
+        rows: By the names of the operator's arguments, and others.
+        background: (..., C, D) behind the first D channels, or None.
+        means2d_abs: Takes sums of absolute gradients, as in `blend`; or None.
+        expected: Whether the last channel, depth, is divided by alpha.
+    """
+    names = ("means2d", "cov2d", "opacities", "features", "dets", "depths", "row_splits")
+    image, alpha, _ = _composite(
+        **{name: rows[name] for name in names},
+        background=background,
+        means2d_abs=means2d_abs,
+        image_height=scene.height,
+        image_width=scene.width,
+        footprint=scene.footprint.key,
+        option=scene.footprint.option,
+        center=_CENTER,
+        expected=expected,
+    )
+    return image, alpha
 
 
-def _join(parts: list[Splats]) -> Splats:
-    """Splats of several projections as of one, camera after camera."""
-    if len(parts) == 1:
-        return parts[0]
-    cameras = [0]
-    splits = [parts[0].row_splits[:1]]
-    for part in parts:
-        cameras.append(cameras[-1] + part.cameras)
-        splits.append(splits[-1][-1] + part.row_splits[1:])
-    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in ROWS}
-    rows["camera_ids"] = torch.cat([part.camera_ids + first for part, first in zip(parts, cameras)])
-    return dataclasses.replace(parts[0], row_splits=torch.cat(splits), **rows)
+def flattened(values: torch.Tensor, dims: int) -> torch.Tensor:
+    """All but the last `dims` dimensions in one; none, where there are no others."""
+    return values if values.dim() == dims else values.flatten(0, -dims - 1)
+
+
+def upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
+    """(..., 6) of (..., 3, 3)."""
+    return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
+
+
+def named(rows: dict[str, Any], sizes: Sizes, packed: bool) -> dict[str, torch.Tensor | None]:
+    """The tensors of `meta`."""
+    ids: dict[str, torch.Tensor | None] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
+    if packed:
+        cameras = rows["camera_ids"].long()
+        ids = {
+            "batch_ids": cameras // sizes.cameras if sizes.batch else torch.zeros_like(cameras),
+            "camera_ids": cameras % sizes.cameras if sizes.batch else cameras,
+            "gaussian_ids": rows["gaussian_ids"].long(),
+        }
+    shown = rows["shown_opacities"]
+    own = {name: rows[name] for name in ("radii", "means2d", "depths", "conics")}
+    return ids | own | {"opacities": shown if shown.numel() else rows["opacities"]}
+
+
+class KeepAbsolute(torch.autograd.Function):
+    """Passes means2d on, with a second tensor that takes the sums of absolute gradients for `means2d.absgrad`."""
+
+    @staticmethod
+    def forward(ctx: Any, means2d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """means2d, and a tensor like it, of any numbers."""
+        ctx.means2d = means2d
+        return means2d.view_as(means2d), torch.empty_like(means2d)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, dL_dmeans2d: torch.Tensor, absolute: torch.Tensor) -> torch.Tensor:
+        """The gradient of means2d as it came; the other one becomes the attribute."""
+        ctx.means2d.absgrad = absolute
+        return dL_dmeans2d

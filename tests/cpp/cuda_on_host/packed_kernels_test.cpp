@@ -84,14 +84,14 @@ struct Packed {
   explicit Packed(Scene& scene) : ends(kCount) {
     ProjectRowsParams p = scene.params();
     std::vector<int32_t> seen(kCount, -1);
-    p.radii = seen.data();
+    p.flags = seen.data();
     project(p);
     for (int i = 0; i < kCount; ++i) ends[i] = count += seen[i] > 0;
     const int64_t first = 1;
     rows.assign(kPackedWidth * (count + 1), -7);
     radii.assign(count + 1, -7);
     ids.assign(count + 1, -7);
-    p.radii = nullptr;
+    p.flags = nullptr;
     p.packed = {as<PackedRow<float>>(rows), count, &first, ends.data(), radii.data(), ids.data(), 1000};
     project(p);  // without room for the last one
     EXPECT_EQ(ids.back(), -7);
@@ -109,8 +109,11 @@ TEST(PackedKernels, RowsAreThoseOfSeparateColumns) {
   Rows rows(kCount);
   std::vector<int32_t> radii(kCount);
   ProjectRowsParams p = scene.params();
-  p.rows = rows.view();
-  p.radii = radii.data();
+  static_cast<ProjectedRows<float>&>(p.rows) = rows.view();  // a table
+  p.rows.features = rows.colors.data();
+  p.rows.stride = 3;
+  p.rows.colored = true;
+  p.rows.radii = radii.data();
   project(p);
   Packed packed(scene);
   ASSERT_GT(packed.count, kCount / 10);
@@ -285,7 +288,7 @@ TEST(PackedKernels, GradientsOfCamerasAreAdded) {
   Gradients one, other, sum;
   const auto run = [&](Gradients& to, const std::vector<int32_t>& of_rows, bool add) {
     p.grads = to.view();
-    p.rows.rows = of_rows.data();
+    p.rows.places.rows = of_rows.data();
     cuda_on_host::launch(kBlocks, kProjectThreads, [&] {
       add ? project_vjp_kernel<Cam, FromRows, StagedGrads>(p) : project_vjp_kernel<Cam, FromRows>(p);
     });
