@@ -85,7 +85,6 @@ def test_wrong_calls():
         _C.Call("activate")(*three, log_scales=three[0])
     with pytest.raises(TypeError, match="activate takes 3 arguments, got 4"):
         _C.Call("activate")(*three, three[0])
-    parameters = [torch.zeros(4, 3)]
     with pytest.raises(TypeError, match="is of a type that Call does not take"):  # lists
         _C.Call("rasterize_vjp")([None])
 

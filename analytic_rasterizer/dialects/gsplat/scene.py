@@ -149,15 +149,15 @@ class Scene:
     def _normals(self) -> Signal:
         """(..., C, N, 3) third axes of the Gaussians in the world; of the two opposite ones that which faces the
         camera."""
-        axes = rotation_matrices(self.gaussians["rotations"])[..., 2].unsqueeze(-3)
-        if self.camera_model == "ortho":
-            rays = self.cameras["viewmatrix"].detach()[:, None, :3, 2]
-            rays = rays.unflatten(0, (*self.sizes.batch, self.sizes.cameras))
-        else:
-            positions = self.cameras["campos"].detach()[:, None].unflatten(0, (*self.sizes.batch, self.sizes.cameras))
-            rays = self.gaussians["means3D"].detach().unsqueeze(-3) - positions
-        facing = (axes * rays).sum(-1, keepdim=True) > 0
-        return Signal(torch.where(facing, -axes, axes), None, True)
+        axes, means = rotation_matrices(self.gaussians["rotations"])[..., 2], self.gaussians["means3D"].detach()
+        orthographic = self.camera_model == "ortho"
+        of_cameras = self.cameras["viewmatrix"][:, :3, 2] if orthographic else self.cameras["campos"]
+        of_cameras = of_cameras.detach().unflatten(0, (*self.sizes.batch, self.sizes.cameras))
+        parts = []
+        for of_camera in of_cameras.unbind(-2):  # one by one: gradients are added in this order
+            rays = of_camera[..., None, :] if orthographic else means - of_camera[..., None, :]
+            parts.append(torch.where((axes * rays).sum(-1, keepdim=True) > 0, -axes, axes))
+        return Signal(torch.stack(parts, -3), None, True)
 
     def _per_camera(self, rows: torch.Tensor) -> Signal:
         """Rows of a table as a signal."""
