@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 
-from .camera import make_lens
+from . import _C
+from .autocast import widened
 from .checks import check_tensors
 from .effects import MAX_SH_DEGREE, Effects
 from .filters import apply_3d_filter
 from .footprints import check_device
+from .ops import Op
 from .seam import has_seam
 from .settings import GaussianRasterizationSettings, check_settings, one_number, whole_number
 from .sh import used_sh_degree
 
 _NOTHING = Effects()
+_prepare_lens = Op("prepare_lens")
+_MAY_BE_TENSORS = ("tanfovx", "tanfovy", "aperture", "focus", "shift", "turn", "screen", "distortion")
 
 
 def gaussian_arguments(
@@ -92,9 +97,8 @@ def camera_arguments(
     if wanted and torch.is_grad_enabled():
         effects = effects.with_camera_gradients()
     if full or degree >= MAX_SH_DEGREE or (effects is not _NOTHING and effects.changes_camera):
-        lens = make_lens(effects, s, means3D)
-        if effects.camera_gradients:
-            tanfovx = tanfovy = 1.0  # the lens has them
+        lens = lens_argument(effects, s, means3D)
+        tanfovx = tanfovy = 1.0  # the lens has them
     return {
         "viewmatrix": view,
         "projmatrix": proj,
@@ -109,3 +113,49 @@ def camera_arguments(
         "footprint": footprint.key,
         "option": footprint.option,
     }
+
+
+def lens_argument(effects: Effects, settings: GaussianRasterizationSettings, like: torch.Tensor) -> torch.Tensor:
+    """The argument `lens` of the ops: the members of `Lens` in csrc/core/lens.h, zero where nothing sets them.
+
+    Args:
+        effects: What the projection has beyond a pinhole.
+        like: A tensor whose dtype and device the result takes.
+    """
+    tensors, numbers, members = {}, [], effects.lens_members()
+    like, tangents = widened(like), {"tanfovx": settings.tanfovx, "tanfovy": settings.tanfovy}
+    for name, tangent in tangents.items():
+        _check_tangent(name, tangent)
+        if isinstance(tangent, torch.Tensor):
+            tensors[name], tangents[name] = tangent.to(like), 1.0
+    members["tan_half_fov"] = [*map(float, tangents.values())]
+    for name, size in _C.LENS:
+        member = members.get(name)
+        if isinstance(member, torch.Tensor):
+            tensors[name], member = member.to(like), None
+        numbers += [0.0] * size if member is None else member if isinstance(member, list) else [member]
+    view, proj = settings.viewmatrix, settings.projmatrix
+    if not effects.camera_gradients:
+        view, proj = view.detach(), proj.detach()
+    (lens,) = _prepare_lens(
+        viewmatrix=widened(view),
+        projmatrix=widened(proj),
+        **{name: tensors.get(name) for name in _MAY_BE_TENSORS},
+        numbers=numbers,
+        height=whole_number("image_height", settings.image_height),
+        centered=effects.off_center,
+    )
+    return lens
+
+
+def _check_tangent(name: str, tangent: float | torch.Tensor) -> None:
+    """Raises for what is no tangent of half a field of view. The value of a tensor is examined on the CPU only."""
+    if isinstance(tangent, torch.Tensor):
+        if tangent.numel() != 1:
+            raise TypeError(f"{name} must be a number, got {tangent!r}")
+        if tangent.device.type != "cpu" or torch.compiler.is_compiling():
+            return
+        tangent = tangent.detach()
+    number = one_number(name, tangent)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {number}")

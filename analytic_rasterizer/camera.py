@@ -1,4 +1,4 @@
-"""Cameras: `View`; settings from a pose and focal lengths, differentiable in both; the operators' argument `lens`."""
+"""Cameras: `View`; settings from a pose and focal lengths, differentiable in both."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import torch
 from . import _C
 from .autocast import widened
 from .checks import check_tensors
-from .effects import AUTO, Effects
+from .effects import AUTO, NEAR, Effects
 from .lens import Lens
+from .ops import Op
 from .rotations import product
 from .settings import GaussianRasterizationSettings, one_number, whole_number
 
-_DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
+_prepare = Op("prepare_cameras")
 
 
 def camera_settings(
@@ -76,17 +77,27 @@ def camera_settings(
     if lens is not None:
         effects = _with_lens(effects, lens)
     view = world_to_camera.double()
-    fx, fy, cx, cy = (
-        torch.as_tensor(v, dtype=torch.float64, device=view.device).reshape(())
-        for v in (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    )
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     orthographic = isinstance(effects, Effects) and effects.orthographic
+    known = not any(isinstance(value, torch.Tensor) for value in (fx, fy, cx, cy))
+    where = "cpu" if known else view.device
+    fx, fy, cx, cy = (torch.as_tensor(v, dtype=torch.float64, device=where).reshape(()) for v in (fx, fy, cx, cy))
     tangents = width / (2 * fx), height / (2 * fy)
-    scale = torch.stack([1 / tangent for tangent in tangents])
-    center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1])
-    projection, position = camera_matrices(view, scale, center, orthographic)
-    if isinstance(effects, Effects) and effects.lens is not None:
-        effects = replace(effects, lens=effects.lens.with_reach(tangents, -center / scale, height))
+    if isinstance(effects, Effects) and effects.lens is not None and known:
+        middle = (width / 2 - cx) / fx, (height / 2 - cy) / fy
+        effects = replace(effects, lens=effects.lens.with_reach(tangents, middle, height))
+    zero, one = fx.new_zeros(()), fx.new_ones(())
+    intrinsics = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3).to(view.device)
+    view, projection, position, _ = _prepare(
+        views=view[None],
+        intrinsics=intrinsics,
+        coefficients=None,
+        width=width,
+        height=height,
+        model="orthographic" if orthographic else "pinhole",
+        near=NEAR,
+        far=math.inf,
+    )
     # Numbers, unless their gradient may be asked for: reading them later makes the host wait for the device.
     asked_for = isinstance(effects, Effects) and effects.camera_gradients
     if not (asked_for or any(t.requires_grad for t in tangents)):
@@ -99,10 +110,10 @@ def camera_settings(
         tanfovy=tangents[1],
         bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
         scale_modifier=scale_modifier,
-        viewmatrix=view.T.to(**to).contiguous(),
-        projmatrix=projection.T.to(**to).contiguous(),
+        viewmatrix=view[0].to(**to),
+        projmatrix=projection[0].to(**to),
         sh_degree=sh_degree,
-        campos=position.to(**to),
+        campos=position[0].to(**to),
         prefiltered=False,
         debug=debug,
         effects=effects,
@@ -119,29 +130,6 @@ def _with_lens(effects: Effects | str | None, lens: Lens) -> Effects | str:
     if effects.lens is not None and effects.lens != lens:
         raise ValueError(f"effects.lens must be None where the camera has a lens, got {effects.lens}")
     return replace(effects, lens=lens)
-
-
-def camera_matrices(
-    view: torch.Tensor, scale: torch.Tensor, center: torch.Tensor, orthographic: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """World to clip space, where the image spans [-1, 1] x [-1, 1], and the camera's centre. Differentiable.
-
-    Args:
-        view: (..., 4, 4) world to camera, for column vectors.
-        scale: (..., 2) clip space per x/z and y/z, twice the focal length over the size of the image; of an
-            orthographic camera per world unit.
-        center: (..., 2) the principal point in clip space.
-        orthographic: Whether w of clip space is 1, and not z.
-
-    Returns:
-        (..., 4, 4) for column vectors, and (..., 3) world units.
-    """
-    near, far = _DEPTH_RANGE
-    w = view[..., 3:, :] if orthographic else view[..., 2:3, :]
-    xy = scale[..., None] * view[..., :2, :] + center[..., None] * w
-    z = far / (far - near) * (view[..., 2:3, :] - near * view[..., 3:, :])
-    position = -torch.linalg.solve(view[..., :3, :3], view[..., :3, 3:])[..., 0]
-    return torch.cat([xy, z, w], -2), position
 
 
 def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
@@ -174,69 +162,10 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
     return product(motion, world_to_camera)
 
 
-def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
-    """The op's argument `lens`: the members of `Lens` in csrc/core/lens.h by their names, zero where nothing sets them.
-
-    Args:
-        effects: What the projection has beyond a pinhole.
-        settings: A `GaussianRasterizationSettings`.
-        like: A tensor whose dtype and device the result takes.
-    """
-    tangents = (settings.tanfovx, settings.tanfovy)
-    for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
-        _check_tangent(name, tangent)
-    if effects.off_center or effects.lens is not None:
-        center = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
-    if effects.lens is not None:
-        height = whole_number("image_height", settings.image_height)
-        effects = replace(effects, lens=effects.lens.with_reach(tangents, center, height))
-    like, members = widened(like), effects.lens_members()
-    members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
-    if effects.off_center or effects.lens is not None:
-        members["center"] = center
-    # Neighbouring numbers are copied to the device together; the last member is never a tensor.
-    parts, floats = [], []
-    for name, size in _C.LENS:
-        member = members.get(name, [0.0] * size)
-        for number in member if isinstance(member, (list, tuple)) else [member]:
-            if isinstance(number, torch.Tensor):
-                parts += [_copied(floats, like)] if floats else []
-                parts.append(number.to(like).reshape(-1))
-                floats = []
-            else:
-                floats.append(float(number))
-    last = _copied(floats, like)
-    return torch.cat([*parts, last]) if parts else last
-
-
-def _check_tangent(name: str, tangent: float | torch.Tensor) -> None:
-    """Raises for what is no tangent of half a field of view. The value of a tensor is examined on the CPU only."""
-    if isinstance(tangent, torch.Tensor):
-        if tangent.numel() != 1:
-            raise TypeError(f"{name} must be a number, got {tangent!r}")
-        if tangent.device.type != "cpu" or torch.compiler.is_compiling():
-            return
-        tangent = tangent.detach()
-    number = one_number(name, tangent)
-    if not 0 < number < math.inf:
-        raise ValueError(f"{name} must be positive and finite, got {number}")
-
-
-def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
-    """A tensor like `like`. It is copied from pinned memory: otherwise the host would wait for all earlier work."""
-    if like.is_cuda and torch.cuda.is_current_stream_capturing():
-        # A replay would copy from host memory that has been reused since.
-        raise RuntimeError("effects of the camera cannot be captured in a CUDA graph")
-    host = torch.tensor(numbers, dtype=like.dtype, device="cpu", pin_memory=like.is_cuda)
-    return host.to(like.device, non_blocking=True)
-
-
-def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
-    """(2,) x/z and y/z at the centre of the picture, where clip_x = p_xx x + p_xz z is zero."""
-    view, proj = widened(view), widened(proj)
+def view_center(view: torch.Tensor, proj: torch.Tensor) -> torch.Tensor:
+    """(2,) x/z and y/z at the centre of the picture, where clip_x = p_xx x + p_xz z is zero. Without gradient."""
+    view, proj = widened(view.detach()), widened(proj.detach())
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # transposed: they act on row vectors
-    if not with_gradient:
-        view, proj = view.detach(), proj.detach()
     p = product(view.T, proj) / (view**2).sum(0)[:, None]
     return -p[2] / p.diagonal()
 
@@ -249,7 +178,7 @@ def is_orthographic(settings) -> bool:
 
 def is_off_center(settings) -> bool:
     """Whether an edge of the picture is more than FRUSTUM_CLAMP half pictures away from the optical axis."""
-    center = view_center(settings.viewmatrix.double(), settings.projmatrix.double(), with_gradient=False)
+    center = view_center(settings.viewmatrix.double(), settings.projmatrix.double())
     tangents = center.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
     return (1 + (center / tangents).abs().max() > _C.FRUSTUM_CLAMP + 1e-6).item()
 

@@ -123,7 +123,7 @@ def _interval_of_lens(means3D: torch.Tensor, camera: Any, effects: Effects) -> t
     points = widened(means3D.detach()).to("cpu", torch.float64)
     points = points @ view[:3, :3] + view[3, :3]
     positions, derivatives = effects.lens.project(points)
-    middle = view_center(camera.viewmatrix, camera.projmatrix, with_gradient=False).to(positions)
+    middle = view_center(camera.viewmatrix, camera.projmatrix).to(positions)
     tangents = positions.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
     inside = ((positions - middle).abs() <= (1 + 2 * MARGIN) * tangents).all(1)
     depth = effects.lens.depths(points)

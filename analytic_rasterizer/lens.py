@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 
@@ -24,9 +23,8 @@ _ABSENT = {"fisheye": {"4 and 5": slice(4, 6)}, "fov": {"from 1 on": slice(1, SI
 SPHERE = "equirectangular"
 MODELS = (*_PARTS, "fov", SPHERE)
 WIDE = ("fisheye", "rad_tan_fisheye")  # models that see beyond 90 degrees from the axis, about the axis
-_DIRECTIONS, _ANGLES = 64, 512  # of the rays with which limits are found
+_ANGLES = 4096  # at which a guess of a direction is found
 _NEWTON_STEPS, _LONGEST_STEP = 30, 0.2  # rad
-_WIDEST_PERSPECTIVE = math.radians(89.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +36,11 @@ class Lens:
 
     Attributes:
         model: One of `perspective`, `fisheye`, `rad_tan_fisheye`, `fov`, `equirectangular`.
-        coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable, whose values
-            the host reads for every picture. `equirectangular` has none.
+        coefficients: (12,) numbers in the order of csrc/core/camera/, or a tensor, differentiable. `equirectangular`
+            has none. A tensor on CUDA is not examined: with numbers that make no map, nothing is seen.
         reach: Angle from the axis, rad, beyond which the Jacobian is that of a ray at this angle; None: 1.3 times the
-            largest (of its tangent, for `perspective` and `fov`) that the picture sees. To find that, the host waits
-            for a CUDA device, unless `camera_settings` made the settings. Of `equirectangular` it is a latitude, below
-            pi/2; None: half a pixel from the poles, as far as the nearest row of pixel centres.
+            largest (of its tangent, for `perspective` and `fov`) that the picture sees. Of `equirectangular` it is a
+            latitude, below pi/2; None: half a pixel from the poles, as far as the nearest row of pixel centres.
 
     Raises:
         TypeError: Coefficients or reach are no numbers.
@@ -191,7 +188,7 @@ class Lens:
             return torch.where(shown[:, None], rays, math.nan)
         # The unknown is the angle from the axis times the unit vector across it. The first guess is the angle that the
         # lens shows at this distance along x.
-        angles = torch.linspace(0, self.fold, 8 * _ANGLES, dtype=torch.float64)
+        angles = torch.linspace(0, self.fold, _ANGLES, dtype=torch.float64)
         shown = self.project(torch.stack([angles.sin(), torch.zeros_like(angles), angles.cos()], 1))[0]
         shown = shown.norm(dim=1).nan_to_num(math.inf).cummax(0).values
         distance = positions.norm(dim=1)
@@ -219,28 +216,24 @@ class Lens:
         """
         if self.reach is not None:
             return self
+        tan_x, tan_y, x, y = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
         if self.model == SPHERE:  # a pixel is 2 tanfovy / height radians high
-            tangent = tangents[1].item() if isinstance(tangents[1], torch.Tensor) else float(tangents[1])
-            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(tangent / height, 1.5))
-        numbers = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
-        reach = _reach(self.model, self.numbers(), *numbers)
+            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(tan_y / height, 1.5))
+        reach = _C.lens_reach(self.model, self.numbers(), tan_x, tan_y, x, y)
         return Lens(self.model, self.coefficients, reach)
 
     @property
     def fold(self) -> float:
         """The angle from the axis at which the map folds back, rad, or where the model ends. Reads the coefficients."""
-        return _fold(self.model, self.numbers())
+        return _C.lens_fold(self.model, self.numbers())
 
     def members(self) -> dict:
-        """The entries of the operator's argument `lens`, by the names of `_C.LENS`."""
-        if self.model == SPHERE:
-            return {"model": float(_C.CAMERA_MODELS.index(SPHERE)), "reach": 1 / math.cos(self.reach)}
-        measure = (lambda angle: angle) if self.model in WIDE else (lambda angle: math.tan(min(angle, 1.57)))
+        """The entries of a lens for the operators, by the names of `_C.LENS`; `reach` is 0 where it is not known."""
+        given = self.coefficients
         return {
             "model": float(_C.CAMERA_MODELS.index(self.model)),
-            "distortion": self.coefficients if isinstance(self.coefficients, torch.Tensor) else list(self.coefficients),
-            "reach": measure(self.reach),
-            "fold": measure(self.fold),
+            "distortion": given if isinstance(given, torch.Tensor) else list(given),
+            "reach": 0.0 if self.reach is None else self.reach,
         }
 
     def numbers(self) -> tuple[float, ...]:
@@ -299,55 +292,3 @@ def _arranged(model: str, radial, tangential, thin_prism) -> tuple[float, ...]:
         numbers = _numbers(name, values, most)
         to[first : first + len(numbers)] = numbers
     return tuple(to)
-
-
-def _rays(angles: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Unit vectors (angles, directions, 3) from the axis, and their derivatives along the angle and across."""
-    turns = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2 * math.pi / _DIRECTIONS)
-    angle, turn = torch.meshgrid(angles, turns, indexing="ij")
-    sine, cosine, x, y, zero = angle.sin(), angle.cos(), turn.cos(), turn.sin(), torch.zeros_like(angle)
-    return (
-        torch.stack([sine * x, sine * y, cosine], -1),
-        torch.stack([cosine * x, cosine * y, -sine], -1),
-        torch.stack([-y, x, zero], -1),
-    )
-
-
-def _end(model: str) -> float:
-    return math.pi - 1e-3 if model in WIDE else _WIDEST_PERSPECTIVE
-
-
-@lru_cache(maxsize=4096)
-def _fold(model: str, coefficients: tuple[float, ...]) -> float:
-    if model == SPHERE:
-        return math.pi
-    first, last = 0.0, _end(model)
-    for _ in range(2):  # the second time between two neighbours of the first
-        angles = torch.linspace(first, last, _ANGLES + 1, dtype=torch.float64)
-        ray, along, across = _rays(angles)
-        slopes = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[1].reshape(*ray.shape[:2], 2, 3)
-        u, v = (slopes * along[..., None, :]).sum(-1), (slopes * across[..., None, :]).sum(-1)
-        area = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-        # Away from the axis it goes on outwards: turned about it would have a positive area, too.
-        outwards = u[..., 0] * across[..., 1] - u[..., 1] * across[..., 0]
-        good = ((area > 0) & area.isfinite() & (outwards > 0)).all(1).tolist()
-        if all(good):
-            return last
-        k = good.index(False)
-        first, last = float(angles[max(k - 1, 0)]), float(angles[k])
-    if not first:
-        raise ValueError(f"the {model} lens with coefficients {coefficients} is no map at its axis")
-    return first
-
-
-@lru_cache(maxsize=4096)
-def _reach(model: str, coefficients: tuple[float, ...], tan_x: float, tan_y: float, x: float, y: float) -> float:
-    fold = _fold(model, coefficients)
-    angles = torch.linspace(0, fold, _ANGLES + 1, dtype=torch.float64)
-    ray = _rays(angles)[0]
-    seen = _C.lens_points(model, list(coefficients), ray.reshape(-1, 3))[0].reshape(*ray.shape[:2], 2)
-    # Nearer to the axis than the farthest corner, in any direction: a strip of a picture may lie between the rays.
-    inside = (seen.norm(dim=2) <= math.hypot(abs(x) + tan_x, abs(y) + tan_y)).any(1).nonzero()
-    largest = float(angles[min(int(inside[-1]) + 1, _ANGLES)]) if len(inside) else fold
-    clamp = _C.FRUSTUM_CLAMP
-    return min(fold, clamp * largest if model in WIDE else math.atan(clamp * math.tan(largest)))

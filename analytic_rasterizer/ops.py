@@ -139,6 +139,32 @@ def _(a):
     return *rasterized, saved, torch.empty(3, dtype=torch.float64, device="cpu")
 
 
+_LENS_WIDTH = sum(size for _, size in _C.LENS)
+
+
+@_register("prepare_cameras")
+def _(a):
+    count, like = a.views.shape[0], a.views
+    return tuple(like.new_empty(count, *rest) for rest in ((4, 4), (4, 4), (3,), (_LENS_WIDTH,)))
+
+
+@_register("prepare_cameras_vjp")
+def _(a):
+    return _gradients(a, "prepare_cameras")
+
+
+@_register("prepare_lens")
+def _(a):
+    return a.viewmatrix.new_empty(_LENS_WIDTH)
+
+
+@_register("prepare_lens_vjp")
+def _(a):
+    for name in ("viewmatrix", "projmatrix"):  # may have one dimension more, of size 1
+        setattr(a, name, getattr(a, name).reshape(4, 4))
+    return _gradients(a, "prepare_lens")
+
+
 @_register("project")
 def _(a):
     like, cameras = a.means3D, a.viewmatrix.shape[0] if a.viewmatrix.dim() == 3 else 1

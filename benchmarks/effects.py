@@ -191,7 +191,7 @@ def lens(of: ar.Lens):
 
     def change(case: EffectCase) -> EffectCase:
         settings = case.settings
-        middle = view_center(settings.viewmatrix, settings.projmatrix, with_gradient=False)
+        middle = view_center(settings.viewmatrix, settings.projmatrix)
         found = of.with_reach((settings.tanfovx, settings.tanfovy), middle)  # once, as `camera_settings` does
         return case.change({"effects": ar.Effects(lens=found)})
 

@@ -940,6 +940,11 @@ def _calls(footprint, options, device, full):
             *of_rows, table, torch.zeros(2, 3, device=device), None, **others, **splats.size, expected=full
         )
         (composited[0].sum() + composited[1].sum()).backward()
+        bent = ar.Effects(lens=ar.Lens("perspective", torch.zeros(12, device=device).requires_grad_()))
+        bent_settings = CAMERA.settings(torch.float32, device, footprint="point", effects=bent)
+        ar.GaussianRasterizer(bent_settings)(means2D=None, **leaves)[0].sum().backward()
+        pose = torch.eye(4, device=device).requires_grad_()
+        ar.camera_settings(pose, 8, 6, 9.0, 9.0).projmatrix.sum().backward()
         offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
         ar.footprint_weight(offset.requires_grad_(), cov2d, footprint, **dict(options)).sum().backward()
     return mode.first
@@ -947,6 +952,7 @@ def _calls(footprint, options, device, full):
 
 OPS = {
     *("rasterize", "rasterize_timed", "rasterize_vjp", "project", "project_vjp", "bin", "blend", "blend_vjp"),
+    *(f"prepare_{what}{suffix}" for what in ("cameras", "lens") for suffix in ("", "_vjp")),
     *("composite", "composite_vjp", "inspect", "footprint_weight", "footprint_weight_vjp"),
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, ..., test_distributed.py

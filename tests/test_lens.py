@@ -577,3 +577,85 @@ def test_what_the_sphere_refuses():
         ar.render_stages(sphere(), **scene)
     with pytest.raises(ValueError, match="lens must not be equirectangular, which is not distributed"):
         ar.distributed.rasterize([sphere()], **scene)
+
+
+# --- limits -----------------------------------------------------------------------------------------
+
+
+def limits_of(lens, tangents, middle, directions=64, angles=512):
+    """`fold` and `reach` of a picture, rad, by rays in all directions at once."""
+    wide = lens.model in ("fisheye", "rad_tan_fisheye")
+
+    def rays(angle):
+        turn = torch.arange(directions, dtype=torch.float64) * (2 * math.pi / directions)
+        angle, turn = torch.meshgrid(angle, turn, indexing="ij")
+        sine, cosine, x, y, zero = angle.sin(), angle.cos(), turn.cos(), turn.sin(), torch.zeros_like(angle)
+        ray = torch.stack([sine * x, sine * y, cosine], -1)
+        return ray, torch.stack([cosine * x, cosine * y, -sine], -1), torch.stack([-y, x, zero], -1)
+
+    def seen(ray):
+        return _C.lens_points(lens.model, list(lens.numbers()), ray.reshape(-1, 3))
+
+    first, last = 0.0, math.pi - 1e-3 if wide else math.radians(89.5)
+    for _ in range(2):
+        angle = torch.linspace(first, last, angles + 1, dtype=torch.float64)
+        ray, along, across = rays(angle)
+        slopes = seen(ray)[1].reshape(*ray.shape[:2], 2, 3)
+        u, v = (slopes * along[..., None, :]).sum(-1), (slopes * across[..., None, :]).sum(-1)
+        area, outwards = (
+            u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0],
+            u[..., 0] * across[..., 1] - u[..., 1] * across[..., 0],
+        )
+        good = ((area > 0) & area.isfinite() & (outwards > 0)).all(1).tolist()
+        if all(good):
+            first = last
+            break
+        k = good.index(False)
+        first, last = float(angle[max(k - 1, 0)]), float(angle[k])
+    fold = first
+    angle = torch.linspace(0, fold, angles + 1, dtype=torch.float64)
+    distances = seen(rays(angle)[0])[0].norm(dim=1).reshape(angles + 1, directions)
+    corner = math.hypot(abs(middle[0]) + tangents[0], abs(middle[1]) + tangents[1])
+    inside = (distances <= corner).any(1).nonzero()
+    largest = float(angle[min(int(inside[-1]) + 1, angles)]) if len(inside) else fold
+    return fold, min(fold, 1.3 * largest if wide else math.atan(1.3 * math.tan(largest)))
+
+
+@pytest.mark.parametrize("picture", [((0.3, 0.2), (0.0, 0.0)), ((0.9, 0.7), (0.3, -0.2)), ((4.0, 3.0), (0.0, 1.0))])
+@pytest.mark.parametrize("lens", [make(s) for make in LENSES.values() for s in SIGNS], ids=lambda lens: lens.model)
+def test_limits_are_those_of_all_directions(lens, picture, device):
+    """Of numbers, which the host looks at, and of a tensor, which CUDA looks at. Angles to 1e-9, or of a tensor in
+    float32 to one of 512 steps, where rounding of the coefficients decides otherwise."""
+    fold, reach = limits_of(lens, *picture)
+    assert lens.fold == pytest.approx(fold, rel=1e-9)
+    assert lens.with_reach(*picture).reach == pytest.approx(reach, rel=1e-9)
+    (tan_x, tan_y), (x, y) = picture
+    width, height = 40, 30
+    fx, fy = width / (2 * tan_x), height / (2 * tan_y)
+    intrinsics = [[fx, 0, width / 2 - x * fx], [0, fy, height / 2 - y * fy], [0, 0, 1]]
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    rows = torch.ops.analytic_rasterizer.prepare_cameras(
+        torch.eye(4, dtype=dtype, device=device)[None],
+        torch.tensor([intrinsics], dtype=dtype, device=device),
+        torch.tensor([lens.numbers()], dtype=dtype, device=device),
+        *(width, height, lens.model, 0.01, math.inf),
+    )[3][0].double().cpu()  # fmt: skip
+    wide = lens.model in ("fisheye", "rad_tan_fisheye")
+    found = [angle if wide else math.atan(angle) for angle in rows[-3:-1].tolist()]
+    near = {"rel": 1e-9} if device == "cpu" else {"abs": 2 * math.pi / 512}
+    assert found == pytest.approx([reach, fold if wide else min(fold, 1.57)], **near)
+
+
+@pytest.mark.parametrize("numbers", [{0: math.nan}, {6: -1e9, 7: 1e9}], ids=["NaN", "folded"])
+def test_a_lens_that_is_no_map(device, numbers):
+    """The CPU raises. CUDA, which would have to wait, shows nothing: the lens folds at its axis."""
+    arguments = [torch.eye(4)[None], torch.tensor([[[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]]), torch.zeros(1, 12)]
+    for place, number in numbers.items():
+        arguments[2][0, place] = number
+    arguments = [t.to(device) for t in arguments]
+    prepare = torch.ops.analytic_rasterizer.prepare_cameras
+    if device == "cpu":
+        with pytest.raises(ValueError, match="coefficients must be finite|is no map at its axis"):
+            prepare(*arguments, 40, 30, "perspective", 0.01, math.inf)
+        return
+    assert prepare(*arguments, 40, 30, "perspective", 0.01, math.inf)[3][0, -2] < 1e-3  # the fold

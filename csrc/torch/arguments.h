@@ -2,6 +2,7 @@
 // and reads the dispatcher's stack with it. check() (checks.h) brings tensors into the form that kernels read.
 #pragma once
 
+#include <array>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -96,6 +97,56 @@ struct RasterizeArguments : Inputs, FootprintArguments {
     visit("debug=False", debug);
     visit("means2d_z=\"zero\"", means2d_z);
     visit("features=None", features);
+  }
+};
+
+/// Cameras of poses, which act on column vectors, and intrinsics. See core/camera/prepare.h.
+struct PrepareCamerasArguments {
+  Tensor views, intrinsics;     ///< (C, 4, 4), (C, 3, 3).
+  OptionalTensor coefficients;  ///< (C, kDistortion), if the model is a lens.
+  int64_t width = 0, height = 0;
+  std::string model;
+  double near = 0, far = 0;
+  bool off_center = true;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("views", views);
+    visit("intrinsics", intrinsics);
+    visit("coefficients", coefficients);
+    visit("width", width);
+    visit("height", height);
+    visit("model", model);
+    visit("near", near);
+    visit("far", far);
+    visit("off_center=True", off_center);
+  }
+};
+
+/// A lens of numbers, some of which may be tensors.
+struct PrepareLensArguments {
+  Tensor viewmatrix, projmatrix;
+  OptionalTensor tanfovx, tanfovy, aperture, focus, shift, turn, screen, distortion;
+  std::vector<double> numbers;  ///< (kLensWidth,), but for `reach` and `fold`, which are angles, 0: not known.
+  int64_t height = 0;           ///< Of the picture, px.
+  bool centered = false;        ///< `center` is the middle of the picture by the matrices.
+
+  std::array<OptionalTensor*, 8> members() {
+    return {&tanfovx, &tanfovy, &aperture, &focus, &shift, &turn, &screen, &distortion};
+  }
+  template <class Visit> void each(Visit&& visit) {
+    visit("viewmatrix", viewmatrix);
+    visit("projmatrix", projmatrix);
+    visit("tanfovx", tanfovx);
+    visit("tanfovy", tanfovy);
+    visit("aperture", aperture);
+    visit("focus", focus);
+    visit("shift", shift);
+    visit("turn", turn);
+    visit("screen", screen);
+    visit("distortion", distortion);
+    visit("numbers", numbers);
+    visit("height", height);
+    visit("centered=False", centered);
   }
 };
 

@@ -64,6 +64,11 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<RasterizeArguments, rasterize>{}, "rasterize", rasterized);
   visit(Op<RasterizeArguments, rasterize_timed>{}, "rasterize_timed", timed);
   visit(Op<VjpArguments<RasterizeArguments>, rasterize_vjp>{}, "rasterize_vjp", gradients);
+  visit(Op<PrepareCamerasArguments, prepare_cameras>{}, "prepare_cameras",
+        "Tensor viewmatrix, Tensor projmatrix, Tensor campos, Tensor lens");
+  visit(Op<VjpArguments<PrepareCamerasArguments>, prepare_cameras_vjp>{}, "prepare_cameras_vjp", gradients);
+  visit(Op<PrepareLensArguments, prepare_lens>{}, "prepare_lens", "Tensor lens");
+  visit(Op<VjpArguments<PrepareLensArguments>, prepare_lens_vjp>{}, "prepare_lens_vjp", gradients);
   visit(Op<ProjectArguments, project>{}, "project", projected);
   visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
   visit(Op<CompositeArguments, composite>{}, "composite", blended);
@@ -142,40 +147,6 @@ std::vector<std::string> image_names() {
 }
 
 template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
-
-/// What a lens makes of points (N, 3) in camera space: positions (N, 2) in focal lengths from the principal point, and
-/// their derivatives (N, 2, 3). Float64 on the CPU, for the limits of a lens and for tests.
-std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<double> distortion, const Tensor& points) {
-  const std::vector<std::string> names = names_of(CameraModels());
-  const auto found = std::find(names.begin(), names.end(), model);
-  TORCH_CHECK(found != names.end() && distortion.size() == size_t(kDistortion) && points.dim() == 2 &&
-              points.size(1) == 3 && points.scalar_type() == at::kDouble && points.device().is_cpu());
-  constexpr double inf = std::numeric_limits<double>::infinity();
-  FullCamera<double> camera = {};
-  camera.view_x.x = camera.view_y.y = camera.view_z.z = 1;
-  camera.size = camera.focal = {1, 1};  // the middle of such a picture is pixel 0
-  camera.lens.near = -inf;
-  camera.lens.far = camera.lens.reach = camera.lens.fold = inf;
-  camera.lens.model = double(found - names.begin());
-  std::copy(distortion.begin(), distortion.end(), camera.lens.distortion);
-  const int64_t n = points.size(0);
-  const Tensor read = points.contiguous(), seen = at::empty({n, 2}, read.options());
-  const Tensor slopes = at::empty({n, 2, 3}, read.options());
-  const auto* p = reinterpret_cast<const Vec3<double>*>(read.const_data_ptr<double>());
-  auto* u = reinterpret_cast<Vec2<double>*>(seen.mutable_data_ptr<double>());
-  auto* j = reinterpret_cast<Vec3<double>*>(slopes.mutable_data_ptr<double>());
-  const int64_t parts = cpu::chunks_of(n);
-  cpu::parallel_for(parts, thread_count(), [&](int64_t k) {
-    const cpu::Part part = cpu::part_of(n, parts, k);
-    for (int64_t i = part.begin; i < part.end; ++i) {
-      u[i] = project_mean(camera, p[i]).pixel;
-      const Jacobian<double> rows = make_jacobian(camera, p[i]);
-      j[2 * i] = rows.x;
-      j[2 * i + 1] = rows.y;
-    }
-  });
-  return {seen, slopes};
-}
 
 /// Bounds of how far splats reach with a footprint: variance that it adds [px^2], level at opacity 1, and a factor for
 /// rounding. A splat of variance v and opacity a shows within factor * sqrt((v + variance) * (level + max(0, 2 log a)))
@@ -285,7 +256,9 @@ PYBIND11_MODULE(_C, m) {
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();
   m.def("lens_points", &ar::ops::lens_points,
-        "Positions and derivatives of points through a lens (csrc/torch/ops.cpp).");
+        "Positions and derivatives of points through a lens (csrc/torch/cameras.cpp).");
+  m.def("lens_fold", &ar::ops::lens_fold, "The angle up to which a lens is a map (csrc/torch/cameras.cpp).");
+  m.def("lens_reach", &ar::ops::lens_reach, "The angle up to which a picture sees, and more (csrc/torch/cameras.cpp).");
   m.def("reach_bounds", &ar::ops::reach_bounds, "Bounds of how far splats reach (csrc/torch/ops.cpp).");
   m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();

@@ -3,6 +3,8 @@
 // in autograd.cpp and cast to float32 in autocast.cpp. Comments list results in the order of the schema.
 #pragma once
 
+#include <string>
+#include <utility>
 #include <vector>
 
 #include "torch/boxing.h"
@@ -17,6 +19,20 @@ Results rasterize(RasterizeArguments a);
 /// The same; seconds (3,) float64 of project, bin and blend. Always saves the lists.
 Results rasterize_timed(RasterizeArguments a);
 Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
+
+/// viewmatrix (C, 4, 4), projmatrix (C, 4, 4), campos (C, 3), lens (C, kLensWidth).
+Results prepare_cameras(PrepareCamerasArguments a);
+Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> a);
+/// lens (kLensWidth,).
+Results prepare_lens(PrepareLensArguments a);
+Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> a);
+/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped in a picture. Both are found
+/// once for a lens.
+double lens_fold(const std::string& model, const std::vector<double>& distortion);
+double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
+                  double y);
+/// What a lens makes of points (N, 3): see lens_points in Python.
+std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<double> distortion, const Tensor& points);
 
 /// Rows, camera after camera: means2d, cov2d, opacities, depths, features (K,); radii, gaussian_ids, camera_ids, int32;
 /// row_splits (C + 1,) int64 on the CPU; dets; of a RowMeasure conics (3,) and shown_opacities, else empty; saved: what

@@ -142,9 +142,9 @@ def rasterization(
     Raises:
         NotImplementedError: What this package does not render; the message names it.
         TypeError: Not a tensor, or a wrong dtype.
-        ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only, those of lenses
-            everywhere.
-        RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
+        ValueError: Wrong shape, device or value. The numbers of cameras and lenses are looked at on the CPU only: on
+            CUDA nothing is seen through a lens that is no map.
+        RuntimeError: CUDA tensors, and an extension without CUDA; or on the CPU a pose in viewmats that is singular.
     """
     given = SimpleNamespace(**{name: widened(v) if name in TENSORS else v for name, v in locals().items()})
     call, sharing = Sharing.agreed(given) if distributed else (checked(given), None)
@@ -195,7 +195,7 @@ def _scene(call: Call, sharing: Sharing | None) -> Scene:
     planes = given.near_plane, given.far_plane
     far = math.inf if cut_later else given.far_plane
     cameras = prepared_cameras(
-        viewmats, intrinsics, coefficients, width, height, given.camera_model, given.near_plane, far
+        viewmats, intrinsics, coefficients, (width, height), given.camera_model, given.near_plane, far
     )
     if given.covars is None:
         covariances = {"scales": given.scales, "rotations": given.quats}
