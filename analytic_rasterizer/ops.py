@@ -252,7 +252,8 @@ def _(a):
 
 @_register("activate")
 def _(a):
-    return tuple(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities))
+    penalty = a.log_scales.new_empty(() if a.opacity_weight or a.scale_weight else 0)
+    return *(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities)), penalty
 
 
 @_register("activate_vjp")

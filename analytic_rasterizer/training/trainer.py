@@ -272,7 +272,7 @@ class Trainer:
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean(), visible
 
     def _differentiate_picture(self, shown: Shown) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The loss of a picture, with the regularizers, the radii, and gradients in the order of `picture_gradients`."""
+        """The loss of a picture with the regularizers, its radii, and gradients in the order of `picture_gradients`."""
         options = self.options
         opacity_weight, scale_weight = options.regularizers
         truth = self.pictures.target(shown.scale, shown.view, shown.background)

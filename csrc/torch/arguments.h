@@ -218,14 +218,15 @@ struct L1SsimArguments : SsimArguments {
 
 struct ActivateArguments {
   Tensor log_scales, quats, logit_opacities;
-  /// Not in the schema. With one of them there is a fourth result, the penalty () of core/activations.h.
-  double opacity_weight = 0, scale_weight = 0;
+  double opacity_weight = 0, scale_weight = 0;  ///< Of the penalty.
   bool has_penalty() const { return opacity_weight != 0 || scale_weight != 0; }
 
   template <class Visit> void each(Visit&& visit) {
     visit("log_scales", log_scales);
     visit("quats", quats);
     visit("logit_opacities", logit_opacities);
+    visit("opacity_weight=0.0", opacity_weight);
+    visit("scale_weight=0.0", scale_weight);
   }
 };
 

@@ -80,7 +80,8 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<SsimArguments>, ssim_map_vjp>{}, "ssim_map_vjp", gradients);
   visit(Op<L1SsimArguments, l1_ssim>{}, "l1_ssim", "Tensor loss, Tensor[] saved");
   visit(Op<VjpArguments<L1SsimArguments>, l1_ssim_vjp>{}, "l1_ssim_vjp", gradients);
-  visit(Op<ActivateArguments, activate>{}, "activate", "Tensor scales, Tensor rotations, Tensor opacities");
+  visit(Op<ActivateArguments, activate>{}, "activate",
+        "Tensor scales, Tensor rotations, Tensor opacities, Tensor penalty");
   visit(Op<VjpArguments<ActivateArguments>, activate_vjp>{}, "activate_vjp", gradients);
   visit(Op<FilterArguments, apply_3d_filter>{}, "apply_3d_filter", "Tensor filtered_scales, Tensor filtered_opacities");
   visit(Op<VjpArguments<FilterArguments>, apply_3d_filter_vjp>{}, "apply_3d_filter_vjp", gradients);

@@ -53,7 +53,7 @@ Results ssim_map_vjp(VjpArguments<SsimArguments> a);
 Results l1_ssim(L1SsimArguments a);
 Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 
-/// scales (N, 3), rotations (N, 4), opacities (N, 1).
+/// scales (N, 3), rotations (N, 4), opacities (N, 1), penalty: () or without weights empty.
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
 

@@ -110,10 +110,8 @@ Results picture_gradients(PictureArguments a) {
     dL_dscales = of_filter[0];
     dL_dopacities = of_filter[1];
   }
-  std::vector<OptionalTensor> dL_dactivated = {dL_dscales, of_scene[6], dL_dopacities};
-  if (parameters.has_penalty()) dL_dactivated.push_back(a.dL_dloss);
-  const std::vector<Tensor> of_parameters =
-      gradients_of(activate_vjp({dL_dactivated, parameters, {}, {true, true, true}}));
+  const std::vector<Tensor> of_parameters = gradients_of(
+      activate_vjp({{dL_dscales, of_scene[6], dL_dopacities, a.dL_dloss}, parameters, {}, {true, true, true}}));
   std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
   if (needs[1]) gradients.push_back(of_scene[1]);
   if (a.exposure) gradients.push_back(dL_dexposure);

@@ -87,11 +87,9 @@ Results activate(ActivateArguments a) {
   t.scales = at::empty(a.log_scales.sizes(), a.log_scales.options());
   t.rotations = at::empty(a.quats.sizes(), a.quats.options());
   t.opacities = at::empty(a.logit_opacities.sizes(), a.logit_opacities.options());
-  if (a.has_penalty()) t.penalty = at::empty({}, a.log_scales.options());
+  t.penalty = a.has_penalty() ? at::empty({}, a.log_scales.options()) : at::empty({0}, a.log_scales.options());
   training_kernels(a.log_scales).activate(t);
-  Results results = {t.scales, t.rotations, t.opacities};
-  if (a.has_penalty()) results.push_back(t.penalty);
-  return results;
+  return {t.scales, t.rotations, t.opacities, t.penalty};
 }
 
 Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
@@ -105,7 +103,7 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   t.dL_dscales = gradient(0, "dL_dscales", a.log_scales);
   t.dL_drotations = gradient(1, "dL_drotations", a.quats);
   t.dL_dopacities = gradient(2, "dL_dopacities", a.logit_opacities);
-  t.dL_dpenalty = gradient_of(arguments.dL_doutputs, 3, "dL_dpenalty", a.log_scales, {});
+  if (a.has_penalty()) t.dL_dpenalty = gradient_of(arguments.dL_doutputs, 3, "dL_dpenalty", a.log_scales, {});
   t.dL_dlog_scales = room_for(arguments.needs[0], a.log_scales);
   t.dL_dquats = room_for(arguments.needs[1], a.quats);
   t.dL_dlogit_opacities = room_for(arguments.needs[2], a.logit_opacities);

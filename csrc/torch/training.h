@@ -30,7 +30,7 @@ struct ActivateTensors {
   Tensor log_scales, quats, logit_opacities;
   PenaltyWeights<double> weights = {};
   Tensor scales, rotations, opacities;
-  Tensor penalty;  ///< ().
+  Tensor penalty;  ///< (), or empty.
   Tensor dL_dscales, dL_drotations, dL_dopacities, dL_dpenalty;
   Tensor dL_dlog_scales, dL_dquats, dL_dlogit_opacities;
 };

@@ -103,6 +103,11 @@ void check_target_type(const Tensor& target, const Like& like) {
                     other.device(), ", got ", target.device());
 }
 
+void check_weights(double opacity_weight, double scale_weight) {
+  TORCH_CHECK_VALUE(std::isfinite(opacity_weight) && std::isfinite(scale_weight),
+                    "opacity_weight and scale_weight must be finite, got ", opacity_weight, " and ", scale_weight);
+}
+
 }  // namespace
 
 void check(SsimArguments& a) {
@@ -128,6 +133,7 @@ void check(ActivateArguments& a) {
   const Like like{a.log_scales, "log_scales"};
   like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
   like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
+  check_weights(a.opacity_weight, a.scale_weight);
 }
 
 void check(FilterArguments& a) {
@@ -225,8 +231,7 @@ void check(PictureArguments& a) {
     check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
   }
   like.check_rows_of(a.filter_3d, "filter_3d", {}, "(N,)");
-  for (const auto& [weight, name] : {std::pair(a.opacity_weight, "opacity_weight"), {a.scale_weight, "scale_weight"}})
-    TORCH_CHECK_VALUE(std::isfinite(weight), name, " must be finite, got ", weight);
+  check_weights(a.opacity_weight, a.scale_weight);
 }
 
 void check(AdamArguments& a) {
