@@ -269,6 +269,7 @@ def test_training_with_lenses(tmp_path, lens):
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
     training = pytest.importorskip("analytic_rasterizer.training", reason="needs the train extra")
     from capture_files import circle, opengl_pose, truth_gaussians
+    from training_step import check_next_step
 
     truth = truth_gaussians()
     points = truth.means.detach()
@@ -299,6 +300,7 @@ def test_training_with_lenses(tmp_path, lens):
     before = run.evaluate()["test"]["mean"]["psnr"]
     run.train()
     assert run.evaluate()["test"]["mean"]["psnr"] > before + 3
+    check_next_step(run.trainer)
 
 
 @pytest.mark.parametrize("lens", [*LENSES, ar.Lens.equirectangular()])
