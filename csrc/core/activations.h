@@ -124,15 +124,14 @@ template <typename T> AR_HD void activate_vjp(const ActivateVjpParams<T>& p, int
 template <typename T> struct FilteredAxis {
   T scale;               ///< sqrt(s^2 + w^2) of scale s and width w
   T by_scale, by_width;  ///< its derivatives s / scale, w / scale; the first is also what is left of the peak
-  T inverse;             ///< 1 / scale; 0 without a filter, as by_width is
 };
 
 /// A negative width makes NaN.
 template <typename T> AR_HD FilteredAxis<T> filter_axis(T s, T width) {
-  if (width == T(0)) return {s, T(1), T(0), T(0)};
+  if (width == T(0)) return {s, T(1), T(0)};
   // hypot neither overflows nor loses small scales.
   const T scale = std::hypot(s, width < T(0) ? std::numeric_limits<T>::quiet_NaN() : width);
-  return {scale, s / scale, width / scale, T(1) / scale};
+  return {scale, s / scale, width / scale};
 }
 
 /// The covariance gains width^2 along every axis; the opacity falls with the peak, which keeps the mass [Mip-Splatting,
@@ -150,10 +149,12 @@ template <typename T> AR_HD void apply_filter_vjp(const FilterVjpParams<T>& p, i
   const T width = p.widths[i], by_opacity = p.dL_dfiltered_opacities ? p.dL_dfiltered_opacities[i] : T(0);
   const FilteredAxis<T> x = filter_axis(s.x, width), y = filter_axis(s.y, width), z = filter_axis(s.z, width);
   const Vec3<T> shares = {x.by_scale, y.by_scale, z.by_scale}, by_width = {x.by_width, y.by_width, z.by_width};
-  // By the share of each axis in the opacity, over the axis' scale. A share s / scale has the derivative
-  // by_width^2 / scale by s, and -share by_width / scale by the width.
   const Vec3<T> others = {y.by_scale * z.by_scale, z.by_scale * x.by_scale, x.by_scale * y.by_scale};
-  const Vec3<T> by_shares = mul((by_opacity * p.opacities[i]) * others, {x.inverse, y.inverse, z.inverse});
+  // By the share of each axis in the opacity, over the axis' scale. The share s / scale has the derivative
+  // by_width^2 / scale by s, and -share by_width / scale by the width. Without a filter both are zero.
+  const Vec3<T> over_scales =
+      width == T(0) ? Vec3<T>{} : Vec3<T>{others.x / x.scale, others.y / y.scale, others.z / z.scale};
+  const Vec3<T> by_shares = (by_opacity * p.opacities[i]) * over_scales;
   if (p.dL_dscales) p.dL_dscales[i] = mul(by_scales, shares) + mul(by_shares, mul(by_width, by_width));
   if (p.dL_dopacities) p.dL_dopacities[i] = by_opacity * (x.by_scale * y.by_scale * z.by_scale);
   if (p.dL_dwidths) p.dL_dwidths[i] = dot(by_scales, by_width) - dot(by_shares, mul(shares, by_width));
