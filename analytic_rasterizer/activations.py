@@ -38,4 +38,4 @@ def activate(
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
         check_device(tensor.device)
-    return torch.ops.analytic_rasterizer.activate(log_scales, quats, logit_opacities)
+    return torch.ops.analytic_rasterizer.activate(log_scales, quats, logit_opacities)[:3]

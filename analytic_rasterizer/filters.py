@@ -14,11 +14,12 @@ from typing import Any
 
 import torch
 
+from . import ops  # noqa: F401  (registers the fake kernels)
 from .autocast import way_out_of, widened
 from .camera import view_center
 from .checks import check_tensors
 from .effects import Effects
-from .footprints import DILATED, resolve_footprint
+from .footprints import DILATED, check_device, resolve_footprint
 from .outputs import depths
 from .rotations import rotation_matrices
 from .seam import has_seam
@@ -139,13 +140,13 @@ def _interval_of_lens(means3D: torch.Tensor, camera: Any, effects: Effects) -> t
 def apply_3d_filter(
     scales: torch.Tensor, opacities: torch.Tensor, filter_3d: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scales and opacities of Gaussians convolved with their filters. Differentiable.
+    """Scales and opacities of Gaussians convolved with their filters. Differentiable once, also by the filter.
 
     The covariance gains filter_3d^2 along every axis; the opacity falls with the peak, so that the mass of a Gaussian
     stays what it was.
 
     Args:
-        scales: (P, 3) standard deviations, world units.
+        scales: (P, 3) standard deviations, world units, float32 or float64.
         opacities: (P, 1) or (P,).
         filter_3d: (P,) world units, from `compute_3d_filter`; 0 where there is none. Where it is negative or not a
             number, the scales become NaN, so that the Gaussian is culled, or named where the settings ask for debug.
@@ -154,8 +155,9 @@ def apply_3d_filter(
         (scales, opacities) of the same shapes.
 
     Raises:
-        TypeError: Something is no tensor, or the dtypes differ.
+        TypeError: Something is no tensor, a wrong dtype, or the dtypes differ.
         ValueError: The shapes or devices do not fit.
+        RuntimeError: CUDA tensors, and an extension without CUDA.
     """
     check_tensors(None, scales=scales, opacities=opacities, filter_3d=filter_3d)
     scales, opacities, filter_3d = widened(scales), widened(opacities), widened(filter_3d)
@@ -171,12 +173,8 @@ def apply_3d_filter(
             raise TypeError(f"{name} must have the dtype of scales, {wanted}, got {tensor.dtype}{way_out}")
         if tensor.device != scales.device:
             raise ValueError(f"{name} must be on the device of scales, {scales.device}, got {tensor.device}")
-    # hypot neither overflows nor loses small scales, and its gradient is finite unless both arguments are 0.
-    width = torch.where(filter_3d < 0, torch.nan, filter_3d)[:, None].expand_as(scales)
-    none = width == 0
-    filtered = torch.where(none, scales, torch.hypot(scales, torch.where(none, 1, width)))
-    share = torch.where(none, 1, scales / torch.where(none, 1, filtered)).prod(1)
-    return filtered, opacities * share.reshape(opacities.shape)
+    check_device(scales.device)
+    return torch.ops.analytic_rasterizer.apply_3d_filter(scales, opacities, filter_3d)
 
 
 @torch.no_grad()

@@ -331,12 +331,23 @@ def _(a):
 
 @_register("activate")
 def _(a):
-    return tuple(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities))
+    penalty = a.log_scales.new_empty(() if a.opacity_weight or a.scale_weight else 0)
+    return *(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities)), penalty
 
 
 @_register("activate_vjp")
 def _(a):
     return _gradients(a, "activate")
+
+
+@_register("apply_3d_filter")
+def _(a):
+    return a.scales.new_empty(a.scales.shape), a.opacities.new_empty(a.opacities.shape)
+
+
+@_register("apply_3d_filter_vjp")
+def _(a):
+    return _gradients(a, "apply_3d_filter")
 
 
 @_register("correct_colors")
@@ -354,12 +365,17 @@ def _(a):
     gradients = [t.new_empty(t.shape) for t in (a.means, a.log_scales, a.quats, a.logit_opacities, a.shs)]
     gradients += [a.means.new_empty(a.means.shape[0], a.mean_columns)] if a.mean_columns else []
     gradients += [] if a.exposure is None else [a.means.new_empty(3, 4)]
-    image = a.means.new_empty(3, a.image_height, a.image_width)
+    image = a.means.new_empty(a.target.shape)
     radii = a.means.new_empty(a.means.shape[0], dtype=torch.int32)
     return a.means.new_empty(()), image, radii, gradients
 
 
 @_register("observe_")
+def _(a):
+    return None
+
+
+@_register("add_noise_")
 def _(a):
     return None
 

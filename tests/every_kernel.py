@@ -25,7 +25,6 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
-from analytic_rasterizer.activations import activate
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.optim import FusedAdam
 
@@ -187,13 +186,17 @@ def steps(device: str) -> None:
     for dtype in (torch.float32, torch.float64):
         numbers = {"dtype": dtype, "device": device}
         leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
-        sum(made.sum() for made in activate(*leaves)).backward()
+        ops = torch.ops.analytic_rasterizer
+        sum(made.sum() for made in ops.activate(*leaves, 0.3, 0.2)).backward()
+        sum(made.sum() for made in ar.apply_3d_filter(leaves[0], leaves[2], torch.rand(300, **numbers))).backward()
         FusedAdam(leaves).step()
         matrix = torch.eye(3, 4, **numbers).requires_grad_()
-        torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
+        ops.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
         sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
         radii = torch.ones(300, dtype=torch.int32, device=device)
-        torch.ops.analytic_rasterizer.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)
+        ops.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)
+        means, normals = (torch.rand(300, 3, **numbers) for _ in range(2))
+        ops.add_noise_(means, *(leaf.detach() for leaf in leaves), normals, 0.5)
 
 
 def training(device: str) -> None:

@@ -141,9 +141,51 @@ def test_opcheck(device):
     given = parameters(6, torch.float32, device)
     ops = torch.ops.analytic_rasterizer
     torch.library.opcheck(ops.activate.default, tuple(t.clone().requires_grad_() for t in given))
-    gradients = [torch.ones_like(t) for t in given]
-    torch.library.opcheck(ops.activate_vjp.default, (gradients, *given, [], [True, True, True]))
-    torch.library.opcheck(ops.activate_vjp.default, ([gradients[0], None, None], *given, [], [True, False, True]))
+    torch.library.opcheck(ops.activate.default, (*(t.clone().requires_grad_() for t in given), 0.3, 0.2))
+    gradients, one = [torch.ones_like(t) for t in given], torch.ones((), device=device)
+    torch.library.opcheck(ops.activate_vjp.default, ([*gradients, None], *given, 0.0, 0.0, [], [True, True, True]))
+    torch.library.opcheck(
+        ops.activate_vjp.default, ([gradients[0], None, None, one], *given, 0.3, 0.2, [], [True, False, True])
+    )
+
+
+@each_precision
+@pytest.mark.parametrize("count", [0, 1, 257, 10_000])
+@pytest.mark.parametrize("weights", [(0.3, 0.0), (0.0, 0.2), (0.3, 0.2)], ids=str)
+def test_the_penalty_and_its_gradients(device, dtype, count, weights):
+    """Weighted sums of opacities and scales, alone and beside gradients of the values themselves."""
+    given, of_values = parameters(count, dtype), parameters(count, dtype, seed=1)
+
+    def penalized(function, leaves):
+        scales, rotations, opacities, *penalty = function(*leaves)
+        penalty = penalty or [weights[0] * opacities.sum() + weights[1] * scales.sum()]
+        return scales, rotations, opacities, penalty[0]
+
+    def op(*leaves):
+        return torch.ops.analytic_rasterizer.activate(*leaves, *weights)
+
+    u = torch.finfo(dtype).eps / 2
+    for use_values in (False, True):
+        made = []
+        for function, where, precision in ((plain, "cpu", torch.float64), (op, device, dtype)):
+            leaves = [t.to(where, precision).requires_grad_() for t in given]
+            *values, penalty = penalized(function, leaves)
+            total = 1.5 * penalty
+            if use_values:
+                total = total + sum((v * w.to(where, precision)).sum() for v, w in zip(values, of_values))
+            gradients = torch.autograd.grad(total, leaves, allow_unused=True)
+            made.append([t.double().cpu() for t in (penalty.detach(), gradients[0], gradients[2])])
+        # The sum is of positive numbers, 5 roundings and 2 ulp each, blocks of 256 in 9 roundings, the rest in double.
+        expected, found = made
+        assert (found[0] - expected[0]).abs() <= 20 * u * expected[0]
+        scales, opacities = (t.double() for t in (given[0].exp(), given[2].sigmoid()))
+        for k, size, weight, of_value in (
+            (1, scales, weights[1], of_values[0]),
+            (2, opacities, weights[0], of_values[2]),
+        ):
+            size = size * (1.5 * weight + (of_value.double().abs() if use_values else 0))
+            assert ((found[k] - expected[k]).abs() <= 20 * u * size).all()
+    assert op(*leaves)[3].shape == () and torch.ops.analytic_rasterizer.activate(*leaves)[3].shape == (0,)
 
 
 @needs_cuda

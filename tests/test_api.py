@@ -956,8 +956,9 @@ OPS = {
     *("composite", "composite_vjp", "inspect", "footprint_weight", "footprint_weight_vjp"),
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, ..., test_distributed.py
-    *(f"{name}{suffix}" for name in ("ssim_map", "l1_ssim", "activate", "correct_colors") for suffix in ("", "_vjp")),
-    *("adam_", "observe_", "picture_gradients"),
+    *("ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"),
+    *("ssim_map_vjp", "l1_ssim_vjp", "activate_vjp", "apply_3d_filter_vjp", "correct_colors_vjp"),
+    *("adam_", "observe_", "add_noise_", "picture_gradients"),
     *("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_"),
 }
 

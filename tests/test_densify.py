@@ -15,6 +15,7 @@ from analytic_rasterizer.training import TrainingOptions, trainer
 from analytic_rasterizer.training import model as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default
+add_noise = torch.ops.analytic_rasterizer.add_noise_.default
 
 EXTENT = 10.0
 SMALL, LARGE, HUGE = 0.05, 0.5, 2.0  # scales that are cloned, split, and pruned once opacities were reset
@@ -250,6 +251,81 @@ def test_what_observe_writes_to_is_apart_from_all_else(written, read):
     with pytest.raises(ValueError, match="gradient_sums and views must not share memory"):
         observe(*arguments)
     assert all(map(torch.equal, arguments, before))
+
+
+def noisy(count=300, dtype=torch.float32, device="cpu"):
+    """Arguments of the op but the strength: Gaussians of all opacities and sizes, and normal numbers."""
+    generator = torch.Generator().manual_seed(2)
+    means, log_scales, quats, logits, normals = (
+        torch.randn(count, width, generator=generator, dtype=torch.float64) for width in (3, 3, 4, 1, 3)
+    )
+    return [t.to(device, dtype) for t in (means, log_scales - 1, 3 * quats, 2 * logits - 5, normals)]
+
+
+def with_noise(means, log_scales, quats, logits, normals, strength):
+    """[MCMC, Eq. 8], and a bound of what its products add up."""
+    strength = strength * torch.sigmoid(100 * (0.005 - logits.sigmoid()))
+    axes, variances = rotation_matrices(quats), (2 * log_scales).exp()
+    covariances = (axes * variances[:, None]) @ axes.transpose(1, 2)
+    size = strength * variances.sum(1, keepdim=True) * normals.abs().sum(1, keepdim=True)
+    return means + strength * (covariances @ normals[:, :, None])[:, :, 0], size
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_noise_is_that_of_its_formula(device, dtype):
+    given = noisy(10_000, dtype, device)
+    expected, size = with_noise(*(t.double().cpu() for t in given), 0.7)
+    before = given[0].clone()
+    add_noise(*given, 0.7)
+    # 100 times an opacity, which is below 1 and good to 5 roundings, is in an exponent; 40 more are in the products.
+    # The formula in float64 has no more.
+    u = torch.finfo(dtype).eps / 2
+    assert ((given[0].double().cpu() - expected).abs() <= 2 * u * (540 * size + expected.abs())).all()
+    assert (given[0] != before).any(1).float().mean() > 0.5
+
+
+def test_noise_of_strided_means_and_of_a_quaternion_of_zero(device):
+    given = noisy(50, torch.float64, device)
+    given[2][7] = 0  # the identity, as in rendering
+    expected, _ = with_noise(*given, 0.5)
+    rows = torch.zeros(50, 7, dtype=torch.float64, device=device)
+    rows[:, 2:5] = given[0]
+    add_noise(rows[:, 2:5], *given[1:], 0.5)
+    torch.testing.assert_close(rows[:, 2:5], expected)
+    assert (rows[:, [0, 1, 5, 6]] == 0).all()
+
+
+def test_opcheck_of_noise(device):
+    torch.library.opcheck(add_noise, (*noisy(7, device=device), 0.5))
+
+
+@pytest.mark.parametrize(
+    "place, wrong, error, message",
+    [
+        (0, torch.zeros(7, 2), ValueError, r"means must have shape \(N, 3\), got \(7, 2\)"),
+        (0, torch.zeros(7, 3).half(), TypeError, "means must have dtype float32 or float64"),
+        (0, torch.zeros(1, 3).expand(7, 3), ValueError, "means must not share memory"),
+        (1, torch.zeros(6, 3), ValueError, r"log_scales must have shape \(N, 3\) with N = 7, got \(6, 3\)"),
+        (2, torch.zeros(7, 4).double(), TypeError, "quats must have the dtype of means"),
+        (3, torch.zeros(7), ValueError, "logit_opacities must have shape"),
+        (4, torch.zeros(7, 4), ValueError, "normals must have shape"),
+        (5, math.nan, ValueError, "strength must be finite and not negative, got nan"),
+    ],
+)
+def test_errors_of_noise(place, wrong, error, message):
+    arguments = [*noisy(7), 0.5]
+    arguments[place] = wrong
+    before = arguments[0].clone()
+    with pytest.raises(error, match=message):
+        add_noise(*arguments)
+    assert torch.equal(arguments[0], before)
+
+
+def test_noise_is_not_read_from_where_it_is_written():
+    arguments = [*noisy(7), 0.5]
+    arguments[4] = arguments[0]
+    with pytest.raises(ValueError, match="means must not share memory with the others"):
+        add_noise(*arguments)
 
 
 def picture_of(gaussians) -> torch.Tensor:

@@ -11,6 +11,7 @@ import torch
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
 from capture_files import circle, draw_picture, write_nerf_synthetic  # noqa: E402
+from training_step import check_next_step  # noqa: E402
 
 from analytic_rasterizer import cli, training  # noqa: E402
 from analytic_rasterizer.training import files  # noqa: E402
@@ -127,13 +128,12 @@ def run_of(folder, out, **options):
     return run
 
 
-def test_the_op_makes_the_bits_of_autograd(uneven, tmp_path, monkeypatch):
-    made = []
-    for name, in_one_op in (("op", True), ("autograd", False)):
-        monkeypatch.setattr(training.trainer.Trainer, "_fits_one_op", lambda _, value=in_one_op: value)
-        run = run_of(uneven, tmp_path / name, iterations=40, exposure="affine")
-        made.append(((tmp_path / name / files.SCENE).read_bytes(), run.trainer.exposures.matrices))
-    assert made[0][0] == made[1][0] and torch.equal(made[0][1], made[1][1])
+@pytest.mark.parametrize("options", [{}, {"scales": (1, 2), "pictures_per_step": 40, "supersampling": 2}], ids=str)
+def test_a_step_has_the_gradients_of_autograd(uneven, tmp_path, options):
+    """Also where a view is in a step several times."""
+    run = run_of(uneven, tmp_path / "out", iterations=12, exposure="affine", **options)
+    assert (run.trainer.exposures.matrices != torch.eye(3, 4)).any()
+    check_next_step(run.trainer)
 
 
 def test_uneven_exposure_is_learned(uneven, tmp_path):

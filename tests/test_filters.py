@@ -5,6 +5,7 @@ import math
 import pytest
 import scenes
 import torch
+from conftest import each_precision
 from scenes import Camera, ParallelCamera
 
 import analytic_rasterizer as ar
@@ -75,10 +76,72 @@ def test_gradients_are_right_and_finite_where_scales_vanish():
     assert torch.autograd.gradcheck(lambda s, o: ar.apply_3d_filter(s, o, width), inputs)
     scales = torch.zeros(6, 3, requires_grad=True)
     opacities = torch.full((6,), 0.5, requires_grad=True)
+    width[3] = 1e-40  # which has no inverse in float32
     filtered, faded = ar.apply_3d_filter(scales, opacities, width.float())
     (filtered.sum() + faded.sum()).backward()
     assert scales.grad.isfinite().all() and opacities.grad.isfinite().all()
     assert (filtered[0] == 0.1).all() and faded[0] == 0
+
+
+def by_formula(scales, opacities, width):
+    """[Mip-Splatting, Eq. 9] of torch's functions, for scales and widths above 0, without differences in gradients."""
+    share = torch.rsqrt(1 + (width[:, None] / scales) ** 2).prod(1)
+    return torch.hypot(scales, width[:, None]), opacities * share.reshape(opacities.shape)
+
+
+def filter_inputs(count, flat=False):
+    """Of sizes from 1e-3 to 1e3; and weights of the results in a loss."""
+    generator = torch.Generator().manual_seed(5)
+    scales, width = (10 ** (6 * torch.rand(count, n, generator=generator, dtype=F64) - 3) for n in (3, 1))
+    opacities = torch.rand(count, 1, generator=generator, dtype=F64)
+    weights = [torch.randn(t.shape, generator=generator, dtype=F64) for t in (scales, opacities)]
+    columns = [t[:, 0] if flat else t for t in (opacities, weights[1])]
+    return [scales, columns[0], width[:, 0]], [weights[0], columns[1]]
+
+
+@each_precision
+@pytest.mark.parametrize("count, flat", [(0, False), (1, True), (10_000, False)])
+def test_values_and_gradients_are_those_of_the_formula(device, dtype, count, flat):
+    given, weights = filter_inputs(count, flat)
+    given, weights = ([t.to(dtype).double() for t in tensors] for tensors in (given, weights))
+    made = []
+    for function, where, precision in ((by_formula, "cpu", F64), (ar.apply_3d_filter, device, dtype)):
+        leaves = [t.to(where, precision).requires_grad_() for t in given]
+        results = function(*leaves)
+        total = sum((r * w.to(where, precision)).sum() for r, w in zip(results, weights))
+        made.append([t.detach().double().cpu() for t in (*results, *torch.autograd.grad(total, leaves))])
+    scales, opacities, width = given[0], given[1].reshape(-1), given[2]
+    by_scales, by_opacity = weights[0].abs(), weights[1].abs().reshape(-1)
+    filtered = torch.hypot(scales, width[:, None])
+    shares, of_width = scales / filtered, width[:, None] / filtered
+    share = shares.prod(1)
+    # What the gradients add up, as absolute values.
+    by_share = (by_opacity * opacities * share)[:, None] / shares / filtered
+    terms = [by_scales * shares + by_share * of_width**2, by_opacity * share]
+    terms.append((by_scales * of_width + by_share * shares * of_width).sum(1))
+    # hypot within 3 ulp and a division are 7 roundings of each axis' share; a product has at most 7 such factors. The
+    # formula in float64 has no more.
+    sizes = [(8, filtered), (24, opacities * share), (64, terms[0]), (32, terms[1]), (64, terms[2])]
+    u = torch.finfo(dtype).eps / 2
+    for expected, found, (roundings, size) in zip(*made, sizes, strict=True):
+        assert ((found - expected).abs() <= 2 * roundings * u * size.reshape(expected.shape)).all()
+
+
+def test_threads_change_no_bit_of_a_filter():
+    given = [t.float() for t in filter_inputs(20_000)[0]]
+    made = []
+    for threads in (1, 2, 7):
+        torch.set_num_threads(threads)
+        made.append(ar.apply_3d_filter(*given))
+    assert all(torch.equal(a, b) for other in made[1:] for a, b in zip(made[0], other))
+
+
+def test_opcheck(device):
+    given, weights = ([t.float().to(device) for t in tensors] for tensors in filter_inputs(6))
+    ops = torch.ops.analytic_rasterizer
+    torch.library.opcheck(ops.apply_3d_filter.default, tuple(t.clone().requires_grad_() for t in given))
+    torch.library.opcheck(ops.apply_3d_filter_vjp.default, (weights, *given, [], [True, True, True]))
+    torch.library.opcheck(ops.apply_3d_filter_vjp.default, ([weights[0], None], *given, [], [True, False, False]))
 
 
 @pytest.mark.parametrize("wrong", [math.nan, -0.1])

@@ -12,6 +12,7 @@ from analytic_rasterizer.losses import l1_ssim
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
 from capture_files import circle, draw_picture, write_colmap  # noqa: E402
+from training_step import check_next_step  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.training import files, photographs, pictures  # noqa: E402
@@ -77,15 +78,10 @@ def test_what_is_masked_teaches_nothing(tmp_path, options, lens, coefficients):
     assert measured["wild"]["mean"]["psnr"] > measured["unmasked"]["mean"]["psnr"] + 1
 
 
-def test_the_op_makes_the_bits_of_autograd(tmp_path, monkeypatch):
+@pytest.mark.parametrize("options", [{}, {"pictures_per_step": 2, "supersampling": 2}], ids=str)
+def test_a_step_has_the_gradients_of_autograd(tmp_path, options):
     write_capture(tmp_path / "scene", wild)
-    scenes = []
-    for name, in_one_op in (("op", True), ("autograd", False)):
-        monkeypatch.setattr(training.trainer.Trainer, "_fits_one_op", lambda _, value=in_one_op: value)
-        run = run_of(tmp_path / "scene", tmp_path / name)
-        assert run.trainer.in_one_op is in_one_op
-        scenes.append((tmp_path / name / files.SCENE).read_bytes())
-    assert scenes[0] == scenes[1]
+    check_next_step(run_of(tmp_path / "scene", tmp_path / "out", iterations=30, **options).trainer)
 
 
 def test_the_loss_of_what_counts(device):

@@ -102,6 +102,9 @@ def test_small_ops_write_every_output(device, count):
         parameters = [torch.rand(count, columns, device=device, requires_grad=True) for columns in (3, 4, 1)]
         for k in range(3):
             torch.ops.analytic_rasterizer.activate(*parameters)[k].sum().backward()
+        torch.ops.analytic_rasterizer.activate(*parameters, 0.3, 0.2)[3].backward()
+        widths = torch.rand(count, device=device, requires_grad=True)
+        sum(t.sum() for t in ar.apply_3d_filter(parameters[0], parameters[2], widths)).backward()
         offsets = torch.ones(count, 2, device=device, requires_grad=True)
         covs = torch.tensor([[2.0, 0.3, 1.0]], device=device).repeat(count, 1).requires_grad_()
         ar.footprint_weight(offsets, covs, "analytic").sum().backward()
@@ -109,7 +112,7 @@ def test_small_ops_write_every_output(device, count):
         target = torch.rand_like(image)
         (l1_ssim(image, target) + ssim(image, target, "none").sum()).backward()
     assert mode.found == []
-    assert len(mode.ops) == 8
+    assert len(mode.ops) == 10
 
 
 @pytest.fixture

@@ -331,7 +331,7 @@ def test_a_sparse_step_updates_what_a_picture_of_any_rank_shows(made):
     one = sharded_alone(made, sparse_adam=True)
     scatter(one.gaussians)
     shown, optimizer = rows_shown(one), optimizer_of_two(one)
-    loss, _, rows, _ = one._loss()
+    loss, _, rows = one._loss()
     assert torch.equal(rows, shown[0] | shown[1]) and not torch.equal(*shown) and 0 < rows.sum() < len(rows)
     loss.backward()
     optimizer.step(rows=rows)

@@ -7,14 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import ops  # noqa: F401  (registers the fake kernels)
 from ..gaussians import Gaussians
 from ..optim import clear_moments, parameter_index
 from ..relocation import compute_relocation
-from ..rotations import rotation_matrices
 from .control import FixedDensity, normal_numbers, passes
 from .options import MonteCarloOptions, options_of
 
-NOISE_SHARPNESS, NOISE_OPACITY = 100, 0.005  # noise fades out around this opacity [MCMC, Eq. 8]
+_add_noise = torch.ops.analytic_rasterizer.add_noise_.default
+
 DRAW_UNITS = 2**30  # probabilities are counted in whole units, whose sums are the same in every run
 
 
@@ -96,14 +97,10 @@ class MonteCarloDensity(FixedDensity):
 
     def _add_noise(self) -> None:
         """Moves means at random, along with their covariance, the more the more transparent they are [MCMC, Eq. 8]."""
-        means, log_scales, rotations, logits = self.gaussians[:4]
+        means = self.gaussians.means
         group, _ = parameter_index(self.optimizer, "means", means)
-        strength = torch.sigmoid(NOISE_SHARPNESS * (NOISE_OPACITY - logits.sigmoid()))
-        strength = strength * (self.options.noise * group["lr"])
-        noise = strength * normal_numbers(means, self.generator)
-        axes = rotation_matrices(rotations)
-        along = (2 * log_scales).exp() * (axes * noise[:, :, None]).sum(1)  # in the Gaussian's frame
-        means += (axes * along[:, None, :]).sum(2)
+        strength = self.options.noise * float(group["lr"])
+        _add_noise(*self.gaussians[:4], normal_numbers(means, self.generator), strength)
 
 
 def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -24,7 +24,7 @@ from ..gaussians import Gaussians
 from ..losses import l1_ssim
 from ..optim import MOMENTS
 from .extent import extent_of
-from .model import render_together
+from .model import filtered, render_together
 from .trainer import Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
@@ -86,15 +86,25 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None, dict[int, Tensor]]:
-        """This rank's part of the loss, whose sum over the ranks is the loss of the step; and the rest as in `Trainer`.
+    @torch.enable_grad()  # whatever the caller has switched off
+    def _differentiate(self) -> tuple[Tensor, Tensor | None]:
+        """As of `Trainer`, by autograd, which sends gradients to the ranks that they belong to."""
+        loss, seen, rows = self._loss()
+        with torch.autograd.set_multithreading_enabled(False):  # as in gradients_by_autograd
+            loss.backward()
+        self._observe(seen)
+        return loss.detach(), rows
+
+    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None]:
+        """This rank's part of the loss, whose sum over the ranks is the loss of the step; what `_observe` takes; and
+        with `sparse_adam` the rows that the optimizer updates.
 
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
         """
         options, shown = self.options, self._next()
         gaussians = self.gaussians.arguments()
         batch = render_together(
-            gaussians,
+            filtered(gaussians, self.filter_3d),
             [picture.settings for picture in shown],
             options.supersampling,
             means2d_abs=options.density == "absgrad",
@@ -119,7 +129,7 @@ class ShardedTrainer(Trainer):
             if self._watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
-        return loss, seen, rows, {}
+        return loss, seen, rows
 
     def _visible(self, shard: Sequence[OwnSplats]) -> Tensor:
         """Which Gaussians of this rank at least one of the pictures shows, (P,) bool. Waits for no device."""

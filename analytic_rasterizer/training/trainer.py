@@ -15,17 +15,16 @@ from .. import _C
 from ..arguments import camera_arguments
 from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
-from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
-from ..lens import SPHERE
-from ..losses import counted, l1_ssim
+from ..losses import counted
+from ..seam import has_seam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
-from .exposure import Exposures, corrected
+from .exposure import Exposures
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
-from .model import render
+from .model import enlarged, gradients_by_autograd
 from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
@@ -117,13 +116,13 @@ class Trainer:
         self.order = PictureOrder(len(pictures.views), options)
         self.exposures = Exposures(len(pictures.views), self.device) if options.exposure == "affine" else None
         self.filter_3d: Tensor | None = None
-        self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
+        share = 1 / options.pictures_per_step  # of a picture's loss in that of the step
+        self.dL_dloss = torch.full((), share, dtype=torch.float32, device=self.device)
         self.losses: list[Tensor] = []
         self._last: tuple[Tensor, Tensor, Tensor | None] | None = None  # picture, target and mask of the last step
         self.dropped, self.warnings = 0, []
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
         self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
-        self.in_one_op = self._fits_one_op()
         if options.filter_3d:
             self._compute_filter()
 
@@ -156,7 +155,7 @@ class Trainer:
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
-        loss, rows = self._differentiate_in_one_op() if self.in_one_op else self._differentiate()
+        loss, rows = self._differentiate()
         self.losses.append(loss)
         optimizer.update(rows)
         optimizer.zero_grad(set_to_none=True)
@@ -214,14 +213,6 @@ class Trainer:
         """Steps of one process that the next step stands for."""
         return 1
 
-    def _fits_one_op(self) -> bool:
-        """Whether the loss of a step is that of one picture of all Gaussians, and nothing else."""
-        options = self.options
-        one = self.ranks.world == 1 and options.pictures_per_step == 1
-        # Which is rendered from the stages.
-        one = one and not any(view.lens is not None and view.lens.model == SPHERE for view in self.pictures.views)
-        return one and options.supersampling == 1 and not options.filter_3d and not any(options.regularizers)
-
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
@@ -243,8 +234,6 @@ class Trainer:
             if self.random_background:
                 background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
-            if self.filter_3d is not None:
-                chosen = chosen._replace(effects=replace(chosen.effects or Effects(), filter_3d=self.filter_3d))
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
@@ -255,88 +244,67 @@ class Trainer:
             numbers = range(first + self.ranks.rank, first + shown + world * self.pictures.horizon, world)
             self.pictures.expect(map(self.order, numbers))
 
-    @torch.enable_grad()  # whatever the caller has switched off
-    def _differentiate(self) -> tuple[Tensor, Tensor | None]:
-        """The loss of the next step, and the rows that the optimizer updates, as `_loss` returns them.
-
-        Gradients of the loss are those of the parameters, and density control has seen them.
-        """
-        loss, seen, rows, exposures = self._loss()
-        # In this thread: otherwise one of the device's does it, and handing over and back takes longer than the kernels
-        # of a small picture.
-        with torch.autograd.set_multithreading_enabled(False):
-            loss.backward(self.one)
-        self._observe(seen)
-        if self.exposures is not None:
-            self.exposures.update({view: leaf.grad for view, leaf in exposures.items()}, self.progress.share)
-        return loss.detach(), rows
-
     @torch.no_grad()
-    def _differentiate_in_one_op(self) -> tuple[Tensor, Tensor | None]:
-        """The same, bit for bit, without what autograd costs the host."""
-        (shown,) = self._next()
-        gaussians, density = self.gaussians, self.density
-        columns = density.columns if self._watches(shown.scale) else 0
+    def _differentiate(self) -> tuple[Tensor, Tensor | None]:
+        """The loss of the next step, and with `sparse_adam` the rows that the optimizer updates: what a picture shows.
+
+        Gradients of the loss are those of the parameters, and density control and the exposures have seen theirs.
+        """
+        fields, losses, of_exposures = list(self.gaussians), [], {}
+        visible: Tensor | None = None
+        for shown in self._next():
+            loss, radii, gradients = self._differentiate_picture(shown)
+            if losses:
+                torch._foreach_add_([field.grad for field in fields], gradients[: len(fields)])
+            else:
+                for field, gradient in zip(fields, gradients):
+                    field.grad = gradient
+            losses.append(loss)
+            if self._watches(shown.scale):
+                self.density.observe_gradients(gradients[len(fields)], radii)
+            if self.exposures is not None:
+                earlier = of_exposures.get(shown.view)  # The step may have this view at several scales.
+                of_exposures[shown.view] = gradients[-1] if earlier is None else earlier + gradients[-1]
+            if self.options.sparse_adam:
+                visible = radii > 0 if visible is None else visible | (radii > 0)
+        if self.exposures is not None:
+            self.exposures.update(of_exposures, self.progress.share)
+        return losses[0] if len(losses) == 1 else torch.stack(losses).mean(), visible
+
+    def _differentiate_picture(self, shown: Shown) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The loss of a picture with the regularizers, its radii, and gradients in the order of `picture_gradients`."""
+        options = self.options
+        opacity_weight, scale_weight = options.regularizers
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
         mask = self.pictures.mask(shown.scale, shown.view)
-        exposure = None if self.exposures is None else self.exposures.matrices[shown.view]
-        loss, image, radii, gradients = _picture_gradients(
-            *gaussians,
-            mean_columns=columns,
-            target=truth,
-            dL_dloss=self.one,
-            exposure=exposure,
-            mask=mask,
-            ssim_weight=self.options.ssim_weight,
-            bg=shown.settings.bg,
-            **self._camera(shown),
-        )
-        for field, gradient in zip(gaussians, gradients):
-            field.grad = gradient
-        if columns:
-            density.observe_gradients(gradients[len(gaussians)], radii)
-        if self.exposures is not None:
-            self.exposures.update({shown.view: gradients[-1]}, self.progress.share)
+        given = {
+            "mean_columns": self.density.columns if self._watches(shown.scale) else 0,
+            "target": truth,
+            "dL_dloss": self.dL_dloss,
+            "exposure": None if self.exposures is None else self.exposures.matrices[shown.view],
+            "mask": mask,
+            "ssim_weight": options.ssim_weight,
+            "filter_3d": self.filter_3d,
+            "supersampling": options.supersampling,
+            "opacity_weight": opacity_weight,
+            "scale_weight": scale_weight,
+        }
+        if has_seam(shown.settings):
+            made = gradients_by_autograd(self.gaussians, shown.settings, **given)
+        else:
+            made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **self._camera(shown))
+        loss, image, radii, gradients = made
         self._last = image, truth, mask
-        return loss, radii > 0 if self.options.sparse_adam else None
+        return loss, radii, gradients
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
         """Camera and footprint of a picture by the names of the ops; made once for every picture and degree."""
         camera = self._cameras.get((shown.scale, shown.view))
         if camera is None:
-            camera = camera_arguments(shown.settings, self.gaussians.means, None)
+            larger = enlarged(shown.settings, self.options.supersampling)
+            camera = camera_arguments(larger, self.gaussians.means, None)
             self._cameras[shown.scale, shown.view] = camera
         return camera
-
-    def _loss(self) -> tuple[Tensor, Any, Tensor | None, dict[int, Tensor]]:
-        """The loss of the next step, what `_observe` takes, with `sparse_adam` which Gaussians a picture shows, and the
-        exposures of the pictures as leaves, by view."""
-        options = self.options
-        gaussians = self.gaussians.arguments()
-        losses, seen, exposures = [], [], {}
-        for scale, view, settings, background in self._next():
-            leaf = self.density.leaf() if self._watches(scale) else None
-            image, radii = render(gaussians, settings, leaf, options.supersampling)
-            truth, mask = self.pictures.target(scale, view, background), self.pictures.mask(scale, view)
-            if self.exposures is not None:
-                leaf_of_view = self.exposures.matrices[view].clone().requires_grad_()
-                image = corrected(image, exposures.setdefault(view, leaf_of_view))
-            losses.append(l1_ssim(image, truth, options.ssim_weight, mask))
-            seen.append((leaf, radii))
-            self._last = image.detach(), truth, mask
-        loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
-        opacity_weight, scale_weight = options.regularizers
-        if opacity_weight:
-            loss = loss + opacity_weight * gaussians["opacities"].mean()
-        if scale_weight:
-            loss = loss + scale_weight * gaussians["scales"].mean()
-        rows = torch.stack([radii > 0 for _, radii in seen]).any(0) if options.sparse_adam else None
-        return loss, seen, rows, exposures
-
-    def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
-        """Lets density control look at the gradients of a step."""
-        for leaf, radii in seen:
-            self.density.observe(leaf, radii)
 
     def _watches(self, scale: int) -> bool:
         """Whether density control sees the gradients of pictures of this scale."""
@@ -357,14 +325,13 @@ class Trainer:
     def _compute_filter(self) -> None:
         self.filter_3d = compute_3d_filter(self.gaussians.means.detach(), self._settings()[min(self.options.scales)])
 
-    @torch.enable_grad()
+    @torch.no_grad()
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
-            image, _ = render(self.gaussians.arguments(), settings[0], supersampling=self.options.supersampling)
-            truth = self.pictures.target(scale, 0, settings[0].bg if self.random_background else None)
-            l1_ssim(image, truth, self.options.ssim_weight).backward()
-        self.optimizer.zero_grad(set_to_none=True)
+            background = settings[0].bg if self.random_background else None
+            self._differentiate_picture(Shown(scale, 0, settings[0], background))
+        self._last = None
 
     def take_losses(self) -> list[float]:
         """The losses of the steps since the last call. Waits for the device.

@@ -19,7 +19,11 @@ template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threa
 template <typename T> void correct_colors(const CorrectParams<T>& p, int threads);
 template <typename T> void correct_colors_vjp(const CorrectVjpParams<T>& p, int threads);
 
+template <typename T> void apply_filter(const FilterParams<T>& p, int threads);
+template <typename T> void apply_filter_vjp(const FilterVjpParams<T>& p, int threads);
+
 template <typename T> void observe(const ObserveParams<T>& p, int threads);
+template <typename T> void add_noise(const NoiseParams<T>& p, int threads);
 
 /// Sets p.first_item.
 template <typename T> void adam(AdamParams<T> p, int threads);

@@ -1,22 +1,50 @@
-// Activations of parameters, their adjoint, and what density control observes, for torch/training_cuda.cpp. Three
-// kernels with a thread per Gaussian; core/activations.h and core/density.h say what they read and write.
+// What a training does to each Gaussian by itself, for torch/training_cuda.cpp: activations, the 3D filter, both
+// adjoints, and what density control observes and adds. Kernels with a thread per Gaussian; core/activations.h and
+// core/density.h say what they read and write. `sum_penalty` adds up what the blocks of `activate` have of the penalty.
 #include "core/activations.h"
 #include "core/density.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training.h"
 #include "cuda/tuning.h"
+#include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = kActivateThreads;
+constexpr int kThreads = kActivateThreads, kWarps = kThreads / 32;
+
+/// In thread 0 of a block of kThreads, in a fixed order. All threads call it, once in a kernel.
+template <typename T> __device__ T block_sum(T own) {
+  __shared__ T of_warps[kWarps];
+  own = warp_sum(own);
+  if (lane_id() == 0) of_warps[threadIdx.x / 32] = own;
+  __syncthreads();
+  T sum = T(0);
+  if (threadIdx.x == 0) {
+    for (int w = 0; w < kWarps; ++w) sum += of_warps[w];
+  }
+  return sum;
+}
 
 // T: float or double. Arrays have a row for each of p.n Gaussians.
-template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
+/// block_sums: [blocks]; null: no penalty is wanted.
+template <typename T> __global__ void activate_kernel(const ActivateParams<T> p, T* block_sums) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::activate(p, i);
+  const T own = i < p.n ? ar::activate(p, i) : T(0);
+  if (!block_sums) return;
+  const T sum = block_sum(own);
+  if (threadIdx.x == 0) block_sums[blockIdx.x] = sum;
+}
+
+/// One block.
+template <typename T> __global__ void sum_penalty_kernel(const T* block_sums, int64_t blocks, T* penalty) {
+  wait_for_earlier_kernels();
+  double own = 0;
+  for (int64_t i = threadIdx.x; i < blocks; i += kThreads) own += double(block_sums[i]);
+  const double sum = block_sum(own);
+  if (threadIdx.x == 0) *penalty = T(sum);
 }
 
 template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
@@ -25,29 +53,71 @@ template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParam
   if (i < p.n) ar::activate_vjp(p, i);
 }
 
+template <typename T> __global__ void apply_filter_kernel(const FilterParams<T> p) {
+  wait_for_earlier_kernels();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::apply_filter(p, i);
+}
+
+template <typename T> __global__ void apply_filter_vjp_kernel(const FilterVjpParams<T> p) {
+  wait_for_earlier_kernels();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::apply_filter_vjp(p, i);
+}
+
 template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::observe(p, i);
 }
 
+template <typename T> __global__ void add_noise_kernel(const NoiseParams<T> p) {
+  wait_for_earlier_kernels();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::add_noise(p, i);
+}
+
+/// A thread for each Gaussian.
+template <class Params> void launch_over_gaussians(void (*kernel)(const Params), const Params& p, cudaStream_t stream) {
+  if (p.n > 0) launch(kernel, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+}
+
 }  // namespace
 
-template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) launch(activate_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+int64_t activate_blocks(int64_t n) { return blocks_of(n, kThreads); }
+
+template <typename T> void activate(const ActivateParams<T>& p, T* block_sums, cudaStream_t stream) {
+  const int64_t blocks = activate_blocks(p.n);
+  if (blocks > 0) launch(activate_kernel<T>, {unsigned(blocks), kThreads}, stream, p, p.penalty ? block_sums : nullptr);
+  if (p.penalty) launch(sum_penalty_kernel<T>, {1, kThreads}, stream, block_sums, blocks, p.penalty);
 }
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) launch(activate_vjp_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+  launch_over_gaussians(activate_vjp_kernel<T>, p, stream);
+}
+template <typename T> void apply_filter(const FilterParams<T>& p, cudaStream_t stream) {
+  launch_over_gaussians(apply_filter_kernel<T>, p, stream);
+}
+template <typename T> void apply_filter_vjp(const FilterVjpParams<T>& p, cudaStream_t stream) {
+  launch_over_gaussians(apply_filter_vjp_kernel<T>, p, stream);
 }
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) launch(observe_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+  launch_over_gaussians(observe_kernel<T>, p, stream);
+}
+template <typename T> void add_noise(const NoiseParams<T>& p, cudaStream_t stream) {
+  launch_over_gaussians(add_noise_kernel<T>, p, stream);
 }
 
-template void activate(const ActivateParams<float>&, cudaStream_t);
-template void activate(const ActivateParams<double>&, cudaStream_t);
+template void activate(const ActivateParams<float>&, float*, cudaStream_t);
+template void activate(const ActivateParams<double>&, double*, cudaStream_t);
 template void activate_vjp(const ActivateVjpParams<float>&, cudaStream_t);
 template void activate_vjp(const ActivateVjpParams<double>&, cudaStream_t);
+template void apply_filter(const FilterParams<float>&, cudaStream_t);
+template void apply_filter(const FilterParams<double>&, cudaStream_t);
+template void apply_filter_vjp(const FilterVjpParams<float>&, cudaStream_t);
+template void apply_filter_vjp(const FilterVjpParams<double>&, cudaStream_t);
 template void observe(const ObserveParams<float>&, cudaStream_t);
 template void observe(const ObserveParams<double>&, cudaStream_t);
+template void add_noise(const NoiseParams<float>&, cudaStream_t);
+template void add_noise(const NoiseParams<double>&, cudaStream_t);
 
 }  // namespace ar::cuda

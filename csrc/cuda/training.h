@@ -20,7 +20,10 @@ template <typename T> int64_t ssim_blocks(int64_t planes, int height, int width)
 template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, T* block_sums, cudaStream_t stream);
 template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, cudaStream_t stream);
 
-template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream);
+/// Fewer than 2^31 for as many Gaussians as int32 numbers.
+int64_t activate_blocks(int64_t n);
+/// block_sums: [activate_blocks], scratch for the penalty.
+template <typename T> void activate(const ActivateParams<T>& p, T* block_sums, cudaStream_t stream);
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream);
 
 /// Fewer than 2^31 for the largest image.
@@ -29,7 +32,11 @@ template <typename T> void correct_colors(const CorrectParams<T>& p, cudaStream_
 /// block_sums: [correct_blocks, kCorrection], scratch for dL_dmatrix.
 template <typename T> void correct_colors_vjp(const CorrectVjpParams<T>& p, T* block_sums, cudaStream_t stream);
 
+template <typename T> void apply_filter(const FilterParams<T>& p, cudaStream_t stream);
+template <typename T> void apply_filter_vjp(const FilterVjpParams<T>& p, cudaStream_t stream);
+
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream);
+template <typename T> void add_noise(const NoiseParams<T>& p, cudaStream_t stream);
 
 /// At least one tensor, and fewer than 2^40 numbers. Sets p.first_item.
 template <typename T> void adam(AdamParams<T> p, cudaStream_t stream);

@@ -324,11 +324,28 @@ struct L1SsimArguments : SsimArguments {
 
 struct ActivateArguments {
   Tensor log_scales, quats, logit_opacities;
+  double opacity_weight = 0, scale_weight = 0;  ///< Of the penalty.
+  bool has_penalty() const { return opacity_weight != 0 || scale_weight != 0; }
 
   template <class Visit> void each(Visit&& visit) {
     visit("log_scales", log_scales);
     visit("quats", quats);
     visit("logit_opacities", logit_opacities);
+    visit("opacity_weight=0.0", opacity_weight);
+    visit("scale_weight=0.0", scale_weight);
+  }
+};
+
+/// See core/activations.h.
+struct FilterArguments {
+  Tensor scales;
+  Tensor opacities;  ///< (P,) or (P, 1).
+  Tensor filter_3d;  ///< (P,).
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("scales", scales);
+    visit("opacities", opacities);
+    visit("filter_3d", filter_3d);
   }
 };
 
@@ -352,6 +369,9 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   double ssim_weight = 0;
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
+  OptionalTensor filter_3d;   ///< (N,), that of `apply_3d_filter`.
+  int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
+  double opacity_weight = 0, scale_weight = 0;  ///< Of the mean opacity and scale, before the filter, in the loss.
 
   template <class Visit> void each(Visit&& visit) {
     visit("means", means);
@@ -372,6 +392,10 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
     visit("lens", lens);
     each_number(visit);
     FootprintArguments::each(visit);
+    visit("filter_3d=None", filter_3d);
+    visit("supersampling=1", supersampling);
+    visit("opacity_weight=0.0", opacity_weight);
+    visit("scale_weight=0.0", scale_weight);
   }
 };
 
@@ -398,6 +422,23 @@ struct ObserveArguments {
     visit("gradients", gradients);
     visit("radii", radii);
     visit("first_column", first_column);
+  }
+};
+
+/// See core/density.h.
+struct NoiseArguments {
+  WrittenTensor<'a'> means;  ///< Any strides.
+  Tensor log_scales, quats, logit_opacities;
+  Tensor normals;  ///< (N, 3).
+  double strength = 0;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("means", means);
+    visit("log_scales", log_scales);
+    visit("quats", quats);
+    visit("logit_opacities", logit_opacities);
+    visit("normals", normals);
+    visit("strength", strength);
   }
 };
 

@@ -20,7 +20,9 @@ void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);
 void check(SsimArguments& a);
 void check(ActivateArguments& a);
+void check(FilterArguments& a);
 void check(ObserveArguments& a);
+void check(NoiseArguments& a);
 /// What the ops inside would find late, or by another name.
 void check(PictureArguments& a);
 void check(CorrectArguments& a);

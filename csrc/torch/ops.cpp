@@ -88,13 +88,17 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<SsimArguments>, ssim_map_vjp>{}, "ssim_map_vjp", gradients);
   visit(Op<L1SsimArguments, l1_ssim>{}, "l1_ssim", "Tensor loss, Tensor[] saved");
   visit(Op<VjpArguments<L1SsimArguments>, l1_ssim_vjp>{}, "l1_ssim_vjp", gradients);
-  visit(Op<ActivateArguments, activate>{}, "activate", "Tensor scales, Tensor rotations, Tensor opacities");
+  visit(Op<ActivateArguments, activate>{}, "activate",
+        "Tensor scales, Tensor rotations, Tensor opacities, Tensor penalty");
   visit(Op<VjpArguments<ActivateArguments>, activate_vjp>{}, "activate_vjp", gradients);
+  visit(Op<FilterArguments, apply_3d_filter>{}, "apply_3d_filter", "Tensor filtered_scales, Tensor filtered_opacities");
+  visit(Op<VjpArguments<FilterArguments>, apply_3d_filter_vjp>{}, "apply_3d_filter_vjp", gradients);
   visit(Op<CorrectArguments, correct_colors>{}, "correct_colors", "Tensor corrected");
   visit(Op<VjpArguments<CorrectArguments>, correct_colors_vjp>{}, "correct_colors_vjp", gradients);
   visit(Op<PictureArguments, picture_gradients>{}, "picture_gradients",
         "Tensor loss, Tensor image, Tensor radii, Tensor[] gradients");
   visit(Op<ObserveArguments, observe>{}, "observe_", "");
+  visit(Op<NoiseArguments, add_noise>{}, "add_noise_", "");
   visit(Op<AdamArguments, adam>{}, "adam_", "");
 }
 

@@ -74,20 +74,26 @@ Results ssim_map_vjp(VjpArguments<SsimArguments> a);
 Results l1_ssim(L1SsimArguments a);
 Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 
-/// scales (N, 3), rotations (N, 4), opacities (N, 1).
+/// scales (N, 3), rotations (N, 4), opacities (N, 1), penalty: () or without weights empty.
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
+
+/// filtered_scales (P, 3), filtered_opacities as opacities.
+Results apply_3d_filter(FilterArguments a);
+Results apply_3d_filter_vjp(VjpArguments<FilterArguments> a);
 
 /// corrected (3, H, W).
 Results correct_colors(CorrectArguments a);
 Results correct_colors_vjp(VjpArguments<CorrectArguments> a);
 
-/// loss (), image (3, H, W), corrected; radii (P,) int32; gradients: of means, log_scales, quats, logit_opacities, shs,
-/// with mean_columns means2D, with an exposure its matrix.
+/// loss (); image (3, H, W) as compared with the target, but for the mask; radii (P,) int32; gradients: of means,
+/// log_scales, quats, logit_opacities, shs, with mean_columns means2D, with an exposure its matrix.
 Results picture_gradients(PictureArguments a);
 
 /// Writes gradient_sums, views.
 Results observe(ObserveArguments a);
+/// Writes means.
+Results add_noise(NoiseArguments a);
 
 /// Writes params, exp_avgs, exp_avg_sqs.
 Results adam(AdamArguments a);

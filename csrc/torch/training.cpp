@@ -1,5 +1,6 @@
-// The ops of a training step besides rendering: loss, activations, colour correction, density control (observe_) and
-// optimiser, with adjoints. They check, allocate, and call the device's TrainingKernels (training.h).
+// The ops of a training step besides rendering: loss, activations, 3D filter, colour correction, density control
+// (observe_, add_noise_) and optimiser, with adjoints. They check, allocate, and call the device's TrainingKernels
+// (training.h).
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -82,12 +83,13 @@ Results l1_ssim_vjp(VjpArguments<L1SsimArguments> arguments) {
 
 Results activate(ActivateArguments a) {
   check(a);
-  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
+  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities, {a.opacity_weight, a.scale_weight}};
   t.scales = at::empty(a.log_scales.sizes(), a.log_scales.options());
   t.rotations = at::empty(a.quats.sizes(), a.quats.options());
   t.opacities = at::empty(a.logit_opacities.sizes(), a.logit_opacities.options());
+  t.penalty = a.has_penalty() ? at::empty({}, a.log_scales.options()) : at::empty({0}, a.log_scales.options());
   training_kernels(a.log_scales).activate(t);
-  return {t.scales, t.rotations, t.opacities};
+  return {t.scales, t.rotations, t.opacities, t.penalty};
 }
 
 Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
@@ -97,15 +99,42 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   const auto gradient = [&](size_t output, const char* name, const Tensor& of) {
     return gradient_of(arguments.dL_doutputs, output, name, a.log_scales, of.sizes());
   };
-  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
+  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities, {a.opacity_weight, a.scale_weight}};
   t.dL_dscales = gradient(0, "dL_dscales", a.log_scales);
   t.dL_drotations = gradient(1, "dL_drotations", a.quats);
   t.dL_dopacities = gradient(2, "dL_dopacities", a.logit_opacities);
+  if (a.has_penalty()) t.dL_dpenalty = gradient_of(arguments.dL_doutputs, 3, "dL_dpenalty", a.log_scales, {});
   t.dL_dlog_scales = room_for(arguments.needs[0], a.log_scales);
   t.dL_dquats = room_for(arguments.needs[1], a.quats);
   t.dL_dlogit_opacities = room_for(arguments.needs[2], a.logit_opacities);
   training_kernels(a.log_scales).activate_vjp(t);
   return {std::vector<Tensor>{t.dL_dlog_scales, t.dL_dquats, t.dL_dlogit_opacities}};
+}
+
+Results apply_3d_filter(FilterArguments a) {
+  check(a);
+  FilterTensors t = {a.scales, a.opacities, a.filter_3d};
+  t.filtered_scales = at::empty(a.scales.sizes(), a.scales.options());
+  t.filtered_opacities = at::empty(a.opacities.sizes(), a.opacities.options());
+  training_kernels(a.scales).apply_filter(t);
+  return {t.filtered_scales, t.filtered_opacities};
+}
+
+Results apply_3d_filter_vjp(VjpArguments<FilterArguments> arguments) {
+  FilterArguments& a = arguments.of_op;
+  check(a);
+  check_needs(arguments.needs, 3);
+  const auto gradient = [&](size_t output, const char* name, const Tensor& of) {
+    return gradient_of(arguments.dL_doutputs, output, name, a.scales, of.sizes());
+  };
+  FilterTensors t = {a.scales, a.opacities, a.filter_3d};
+  t.dL_dfiltered_scales = gradient(0, "dL_dfiltered_scales", a.scales);
+  t.dL_dfiltered_opacities = gradient(1, "dL_dfiltered_opacities", a.opacities);
+  t.dL_dscales = room_for(arguments.needs[0], a.scales);
+  t.dL_dopacities = room_for(arguments.needs[1], a.opacities);
+  t.dL_dfilter_3d = room_for(arguments.needs[2], a.filter_3d);
+  training_kernels(a.scales).apply_filter_vjp(t);
+  return {std::vector<Tensor>{t.dL_dscales, t.dL_dopacities, t.dL_dfilter_3d}};
 }
 
 Results correct_colors(CorrectArguments a) {
@@ -133,6 +162,16 @@ Results observe(ObserveArguments a) {
   training_kernels(a.gradient_sums).observe(a);
   note_written(a.gradient_sums);
   note_written(a.views);
+  return {};
+}
+
+Results add_noise(NoiseArguments a) {
+  check(a);
+  const Tensor means = a.means;
+  note_written(means);
+  static_cast<Tensor&>(a.means) = means.contiguous();
+  training_kernels(means).add_noise(a);
+  if (!means.is_contiguous()) means.copy_(a.means);
   return {};
 }
 

@@ -28,9 +28,18 @@ struct SsimTensors {
 
 struct ActivateTensors {
   Tensor log_scales, quats, logit_opacities;
+  PenaltyWeights<double> weights = {};
   Tensor scales, rotations, opacities;
-  Tensor dL_dscales, dL_drotations, dL_dopacities;
+  Tensor penalty;  ///< (), or empty.
+  Tensor dL_dscales, dL_drotations, dL_dopacities, dL_dpenalty;
   Tensor dL_dlog_scales, dL_dquats, dL_dlogit_opacities;
+};
+
+struct FilterTensors {
+  Tensor scales, opacities, filter_3d;
+  Tensor filtered_scales, filtered_opacities;
+  Tensor dL_dfiltered_scales, dL_dfiltered_opacities;
+  Tensor dL_dscales, dL_dopacities, dL_dfilter_3d;
 };
 
 struct CorrectTensors {
@@ -48,9 +57,12 @@ class TrainingKernels {
   virtual void ssim_vjp(const SsimTensors& t) const = 0;
   virtual void activate(const ActivateTensors& t) const = 0;
   virtual void activate_vjp(const ActivateTensors& t) const = 0;
+  virtual void apply_filter(const FilterTensors& t) const = 0;
+  virtual void apply_filter_vjp(const FilterTensors& t) const = 0;
   virtual void correct_colors(const CorrectTensors& t) const = 0;
   virtual void correct_colors_vjp(const CorrectTensors& t) const = 0;
   virtual void observe(const ObserveArguments& a) const = 0;
+  virtual void add_noise(const NoiseArguments& a) const = 0;
   virtual void adam(const AdamArguments& a) const = 0;
 };
 const TrainingKernels& cpu_training_kernels();
@@ -112,6 +124,7 @@ template <typename T, class Params> void set_parameters(Params& p, const Activat
   p.log_scales = const_pointer<Vec3<T>>(t.log_scales);
   p.quats = const_pointer<Vec4<T>>(t.quats);
   p.logit_opacities = const_pointer<T>(t.logit_opacities);
+  p.weights = {T(t.weights.opacity), T(t.weights.scale)};
 }
 
 template <typename T> ActivateParams<T> activate_params(const ActivateTensors& t) {
@@ -120,6 +133,7 @@ template <typename T> ActivateParams<T> activate_params(const ActivateTensors& t
   p.scales = pointer<Vec3<T>>(t.scales);
   p.rotations = pointer<Vec4<T>>(t.rotations);
   p.opacities = pointer<T>(t.opacities);
+  p.penalty = pointer<T>(t.penalty);
   return p;
 }
 
@@ -129,9 +143,37 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   p.dL_dscales = const_pointer<Vec3<T>>(t.dL_dscales);
   p.dL_drotations = const_pointer<Vec4<T>>(t.dL_drotations);
   p.dL_dopacities = const_pointer<T>(t.dL_dopacities);
+  p.dL_dpenalty = const_pointer<T>(t.dL_dpenalty);
   p.dL_dlog_scales = pointer<Vec3<T>>(t.dL_dlog_scales);
   p.dL_dquats = pointer<Vec4<T>>(t.dL_dquats);
   p.dL_dlogit_opacities = pointer<T>(t.dL_dlogit_opacities);
+  return p;
+}
+
+/// For apply_filter and its adjoint.
+template <typename T, class Params> void set_filter(Params& p, const FilterTensors& t) {
+  p.n = t.scales.size(0);
+  p.scales = const_pointer<Vec3<T>>(t.scales);
+  p.opacities = const_pointer<T>(t.opacities);
+  p.widths = const_pointer<T>(t.filter_3d);
+}
+
+template <typename T> FilterParams<T> filter_params(const FilterTensors& t) {
+  FilterParams<T> p = {};
+  set_filter<T>(p, t);
+  p.filtered_scales = pointer<Vec3<T>>(t.filtered_scales);
+  p.filtered_opacities = pointer<T>(t.filtered_opacities);
+  return p;
+}
+
+template <typename T> FilterVjpParams<T> filter_vjp_params(const FilterTensors& t) {
+  FilterVjpParams<T> p = {};
+  set_filter<T>(p, t);
+  p.dL_dfiltered_scales = const_pointer<Vec3<T>>(t.dL_dfiltered_scales);
+  p.dL_dfiltered_opacities = const_pointer<T>(t.dL_dfiltered_opacities);
+  p.dL_dscales = pointer<Vec3<T>>(t.dL_dscales);
+  p.dL_dopacities = pointer<T>(t.dL_dopacities);
+  p.dL_dwidths = pointer<T>(t.dL_dfilter_3d);
   return p;
 }
 
@@ -167,6 +209,18 @@ template <typename T> ObserveParams<T> observe_params(const ObserveArguments& a)
   p.radii = const_pointer<int32_t>(a.radii);
   p.gradient_sums = pointer<T>(a.gradient_sums);
   p.views = pointer<int32_t>(a.views);
+  return p;
+}
+
+template <typename T> NoiseParams<T> noise_params(const NoiseArguments& a) {
+  NoiseParams<T> p = {};
+  p.n = a.means.size(0);
+  p.means = pointer<Vec3<T>>(a.means);
+  p.log_scales = const_pointer<Vec3<T>>(a.log_scales);
+  p.quats = const_pointer<Vec4<T>>(a.quats);
+  p.logit_opacities = const_pointer<T>(a.logit_opacities);
+  p.normals = const_pointer<Vec3<T>>(a.normals);
+  p.strength = T(a.strength);
   return p;
 }
 

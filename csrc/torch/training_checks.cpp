@@ -103,6 +103,11 @@ void check_target_type(const Tensor& target, const Like& like) {
                     other.device(), ", got ", target.device());
 }
 
+void check_weights(double opacity_weight, double scale_weight) {
+  TORCH_CHECK_VALUE(std::isfinite(opacity_weight) && std::isfinite(scale_weight),
+                    "opacity_weight and scale_weight must be finite, got ", opacity_weight, " and ", scale_weight);
+}
+
 }  // namespace
 
 void check(SsimArguments& a) {
@@ -128,6 +133,18 @@ void check(ActivateArguments& a) {
   const Like like{a.log_scales, "log_scales"};
   like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
   like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
+  check_weights(a.opacity_weight, a.scale_weight);
+}
+
+void check(FilterArguments& a) {
+  check_floating(a.scales, "scales");
+  check_shape(a.scales.dim() == 2 && a.scales.size(1) == 3, a.scales, "scales", "(P, 3)");
+  a.scales = a.scales.contiguous();
+  const Like like{a.scales, "scales"};
+  const bool flat = a.opacities.dim() == 1;
+  if (flat) like.check_rows_of(a.opacities, "opacities", {}, "(P,)");
+  if (!flat) like.check_rows_of(a.opacities, "opacities", {1}, "(P, 1) or (P,)");
+  like.check_rows_of(a.filter_3d, "filter_3d", {}, "(P,)");
 }
 
 void check(ObserveArguments& a) {
@@ -157,6 +174,23 @@ void check(ObserveArguments& a) {
                     "gradient_sums and views must not share memory with each other or with gradients and radii");
 }
 
+void check(NoiseArguments& a) {
+  check_floating(a.means, "means");
+  check_shape(a.means.dim() == 2 && a.means.size(1) == 3, a.means, "means", "(N, 3)");
+  const Like like{a.means, "means"};
+  like.check_rows_of(a.log_scales, "log_scales", {3}, "(N, 3)");
+  like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
+  like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
+  like.check_rows_of(a.normals, "normals", {3}, "(N, 3)");
+  TORCH_CHECK_VALUE(std::isfinite(a.strength) && a.strength >= 0, "strength must be finite and not negative, got ",
+                    a.strength);
+  bool apart = !may_overlap_itself(a.means);
+  for (const Tensor& t : {a.log_scales, a.quats, a.logit_opacities, a.normals})
+    apart = apart && at::get_overlap_status(a.means, t) != at::MemOverlapStatus::Full &&
+            at::get_overlap_status(a.means, t) != at::MemOverlapStatus::Partial;
+  TORCH_CHECK_VALUE(apart, "means must not share memory with the others, or within itself");
+}
+
 void check(CorrectArguments& a) {
   check_floating(a.image, "image");
   check_shape(a.image.dim() == 3 && a.image.size(0) == 3, a.image, "image", "(3, H, W)");
@@ -181,7 +215,11 @@ void check(PictureArguments& a) {
   like.check_type(a.dL_dloss, "dL_dloss");
   check_shape(a.dL_dloss.dim() == 0, a.dL_dloss, "dL_dloss", "()");
   check_target_type(a.target, like);
-  const std::vector<int64_t> image = {3, a.image_height, a.image_width};
+  const int64_t times = a.supersampling;
+  TORCH_CHECK_VALUE(times >= 1 && a.image_height % times == 0 && a.image_width % times == 0,
+                    "supersampling must be at least 1 and divide image_height and image_width, ", a.image_height,
+                    " and ", a.image_width, ", got ", times);
+  const std::vector<int64_t> image = {3, a.image_height / times, a.image_width / times};
   check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
   if (a.exposure) {
     like.check_type(*a.exposure, "exposure");
@@ -189,9 +227,11 @@ void check(PictureArguments& a) {
   }
   if (a.mask) {
     like.check_type(*a.mask, "mask");
-    const std::vector<int64_t> pixels = {a.image_height, a.image_width};
+    const std::vector<int64_t> pixels = {image[1], image[2]};
     check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
   }
+  like.check_rows_of(a.filter_3d, "filter_3d", {}, "(N,)");
+  check_weights(a.opacity_weight, a.scale_weight);
 }
 
 void check(AdamArguments& a) {

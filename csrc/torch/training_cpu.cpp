@@ -27,6 +27,13 @@ class CpuTrainingKernels final : public TrainingKernels {
     visit_scalar(t.log_scales,
                  [&](auto scalar) { cpu::activate_vjp(activate_vjp_params<decltype(scalar)>(t), thread_count()); });
   }
+  void apply_filter(const FilterTensors& t) const override {
+    visit_scalar(t.scales, [&](auto scalar) { cpu::apply_filter(filter_params<decltype(scalar)>(t), thread_count()); });
+  }
+  void apply_filter_vjp(const FilterTensors& t) const override {
+    visit_scalar(t.scales,
+                 [&](auto scalar) { cpu::apply_filter_vjp(filter_vjp_params<decltype(scalar)>(t), thread_count()); });
+  }
   void correct_colors(const CorrectTensors& t) const override {
     visit_scalar(t.image,
                  [&](auto scalar) { cpu::correct_colors(correct_params<decltype(scalar)>(t), thread_count()); });
@@ -39,6 +46,9 @@ class CpuTrainingKernels final : public TrainingKernels {
   void observe(const ObserveArguments& a) const override {
     visit_scalar(a.gradient_sums,
                  [&](auto scalar) { cpu::observe(observe_params<decltype(scalar)>(a), thread_count()); });
+  }
+  void add_noise(const NoiseArguments& a) const override {
+    visit_scalar(a.means, [&](auto scalar) { cpu::add_noise(noise_params<decltype(scalar)>(a), thread_count()); });
   }
   void adam(const AdamArguments& a) const override {
     visit_scalar(a.params[0], [&](auto scalar) {

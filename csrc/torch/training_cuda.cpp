@@ -44,14 +44,29 @@ class CudaTrainingKernels final : public TrainingKernels {
   }
   void activate(const ActivateTensors& t) const override {
     visit_scalar(t.log_scales, [&](auto scalar) {
-      const auto p = activate_params<decltype(scalar)>(t);
-      on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate(p, stream); });
+      using T = decltype(scalar);
+      const auto p = activate_params<T>(t);
+      const int64_t blocks = p.penalty ? cuda::activate_blocks(p.n) : 0;
+      const Tensor block_sums = blocks ? at::empty({blocks}, t.log_scales.options()) : Tensor();
+      on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate(p, pointer<T>(block_sums), stream); });
     });
   }
   void activate_vjp(const ActivateTensors& t) const override {
     visit_scalar(t.log_scales, [&](auto scalar) {
       const auto p = activate_vjp_params<decltype(scalar)>(t);
       on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate_vjp(p, stream); });
+    });
+  }
+  void apply_filter(const FilterTensors& t) const override {
+    visit_scalar(t.scales, [&](auto scalar) {
+      const auto p = filter_params<decltype(scalar)>(t);
+      on_stream(t.scales, [&](cudaStream_t stream) { cuda::apply_filter(p, stream); });
+    });
+  }
+  void apply_filter_vjp(const FilterTensors& t) const override {
+    visit_scalar(t.scales, [&](auto scalar) {
+      const auto p = filter_vjp_params<decltype(scalar)>(t);
+      on_stream(t.scales, [&](cudaStream_t stream) { cuda::apply_filter_vjp(p, stream); });
     });
   }
   void correct_colors(const CorrectTensors& t) const override {
@@ -73,6 +88,12 @@ class CudaTrainingKernels final : public TrainingKernels {
     visit_scalar(a.gradient_sums, [&](auto scalar) {
       const auto p = observe_params<decltype(scalar)>(a);
       on_stream(a.gradient_sums, [&](cudaStream_t stream) { cuda::observe(p, stream); });
+    });
+  }
+  void add_noise(const NoiseArguments& a) const override {
+    visit_scalar(a.means, [&](auto scalar) {
+      const auto p = noise_params<decltype(scalar)>(a);
+      on_stream(a.means, [&](cudaStream_t stream) { cuda::add_noise(p, stream); });
     });
   }
   void adam(const AdamArguments& a) const override {
