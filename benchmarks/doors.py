@@ -3,11 +3,14 @@
     python benchmarks/doors.py SCENE --views VIEWS [--footprint box:samples=1] [--doors plain lens ...] [--cameras 1 4]
 
 Every door renders the first view, or with 4 cameras the views in turn, forward alone and with the backward pass of
-sum(image * w) for fixed random w. Columns: `ms`, the time of a call between two events on an idle device; `host`, the time
-until the call has returned, without waiting for the device; `events`, kernels, copies and memsets; `used` and
-`reserved`, MiB of torch's allocator at the peak of forward and backward, above what the scene takes; `plain`, the ratio
-to the drop-in without effects; `gsplat`, the ratio to the same call of gsplat's own, where that is installed. Medians
-over rounds in turn. On the CPU there are times only, on one thread with --threads 1.
+sum(image * w) for fixed random w. Medians over rounds in turn, in ms. On the CPU there are times only. With CUDA:
+
+- forward, f+b: the time between two events around a call on an idle device;
+- host: the time until the call has returned, which waits for nothing;
+- events: kernels, copies and memsets;
+- used, reserved: MiB of torch's allocator at the peak of forward and backward, above what the scene takes;
+- plain: the ratio to the drop-in without effects;
+- gsplat: the ratio to the same call of gsplat's own, where that is installed.
 
 `--tiny` takes no scene: ten Gaussians in a picture of 16x16 px, where nothing counts but what the host does.
 """
