@@ -144,4 +144,27 @@ AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>&
   return by_view;
 }
 
+/// Gradients by the numbers that users give of a camera, from CameraGrads of parts of the Gaussians.
+template <typename T> struct CameraGradSums {
+  const T* parts;  ///< [n, kCameraGradWidth]
+  int64_t n;
+  T *view, *proj, *position, *lens;  ///< [16] transposed, [16] transposed, [3], [kLensWidth]; or null
+};
+inline constexpr int kCameraNumbers = 16 + 16 + 3 + kLensWidth;
+
+/// Of the numbers of view, proj, position and lens, one after the other: where to write it, and the column of
+/// CameraGrad that it is the sum of; -1: it is zero.
+template <typename T> struct CameraNumber {
+  T* to;
+  int column;
+};
+template <typename T> AR_HD CameraNumber<T> camera_number(const CameraGradSums<T>& sums, int k) {
+  const auto at = [](T* first, int i) { return first ? first + i : nullptr; };
+  const int row = k % 4, column = k % 16 / 4;
+  if (k < 16) return {at(sums.view, k), row < 3 ? 4 * row + column : -1};
+  if (k < 32) return {at(sums.proj, k - 16), row < 2 ? 12 + 4 * row + column : row == 2 ? -1 : 20 + column};
+  if (k < 35) return {at(sums.position, k - 32), 24 + k - 32};
+  return {at(sums.lens, k - 35), 27 + k - 35};
+}
+
 }  // namespace ar

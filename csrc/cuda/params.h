@@ -228,6 +228,7 @@ void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
 /// `begun`: as in LaunchShape.
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
+void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 

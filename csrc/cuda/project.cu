@@ -59,6 +59,9 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
               stream);
 }
 
+void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream) {
+  launch(sum_camera_grads_kernel, {kCameraNumbers, kSumThreads}, stream, p);
+}
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch_rows(shape_rows_kernel, p, p.n, stream); }
 void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch_rows(row_grads_kernel, p, p.n, stream); }
 

@@ -249,6 +249,23 @@ __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZero
   }
 }
 
+/// A block per number.
+__global__ void __launch_bounds__(kSumThreads) sum_camera_grads_kernel(const CameraGradSums<float> params) {
+  wait_for_earlier_kernels();
+  __shared__ double parts[kSumThreads];
+  const CameraNumber<float> number = camera_number(params, int(blockIdx.x));
+  if (!number.to) return;
+  double sum = 0;
+  for (int64_t i = threadIdx.x; number.column >= 0 && i < params.n; i += kSumThreads)
+    sum += params.parts[i * kCameraGradWidth + number.column];
+  parts[threadIdx.x] = sum;
+  for (int half = kSumThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) parts[threadIdx.x] += parts[threadIdx.x + half];
+  }
+  if (threadIdx.x == 0) *number.to = float(parts[0]);
+}
+
 /// A thread per row.
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
   wait_for_earlier_kernels();

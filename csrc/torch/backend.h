@@ -240,6 +240,8 @@ class Backend {
                              const ChannelTensors& channels, const Grads& grads) = 0;
   /// The same from gradients of public rows. Adds if grads.add.
   virtual Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) = 0;
+  /// From what the two above returned to gradients by the camera, where these are defined: in double, in a fixed order.
+  virtual void sum_camera_grads(const Tensor& parts, const Grads& grads) = 0;
   /// Writes dL_drows.
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                          const RowTensors& dL_drows) = 0;

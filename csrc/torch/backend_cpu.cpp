@@ -264,6 +264,18 @@ template <typename T> class CpuBackend final : public Backend {
     return camera_grads;
   }
 
+  void sum_camera_grads(const Tensor& parts, const Grads& grads) override {
+    const CameraGradSums<T> sums = camera_sums_of<T>(parts, grads);
+    for (int k = 0; k < kCameraNumbers; ++k) {
+      const CameraNumber<T> number = camera_number(sums, k);
+      if (!number.to) continue;
+      double sum = 0;
+      for (int64_t i = 0; number.column >= 0 && i < sums.n; ++i)
+        sum += double(sums.parts[i * kCameraGradWidth + number.column]);
+      *number.to = T(sum);
+    }
+  }
+
   void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                  const RowTensors& dL_drows) override {
     cpu::RowGradsParams<T> p = {};

@@ -287,6 +287,11 @@ class CudaBackend final : public Backend {
     return camera_grads;
   }
 
+  void sum_camera_grads(const Tensor& parts, const Grads& grads) override {
+    cuda::sum_camera_grads(camera_sums_of<float>(parts, grads), stream_);
+    check_stage("sum_camera_grads", false);
+  }
+
   void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                  const RowTensors& dL_drows) override {
     cuda::RowGradsParams p = {};

@@ -167,7 +167,7 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     backend->zero_culled_grads(a, saved.lists, pass, grads);
     const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, mean_sums);
     const Tensor camera = backend->project_vjp(a, saved.lists, pass, sums, channels, grads);
-    if (grads.with_camera) set_camera_grads(camera, needs, grads);
+    if (grads.with_camera) set_camera_grads(*backend, camera, needs, grads);
     Tensor background, features;
     if (channels.given.defined() && needs[a.features ? kSceneTensors + 1 : 4]) {
       Tensor& grad = a.features ? features : grads.colors_precomp;

@@ -4,11 +4,9 @@
 
 #include <ATen/ops/aminmax.h>
 #include <ATen/ops/arange.h>
-#include <ATen/ops/cat.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/full.h>
 #include <ATen/ops/stack.h>
-#include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
@@ -49,18 +47,13 @@ Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
   return grads;
 }
 
-void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads) {
-  // In double, and always in the same order.
-  const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
-  // Rows of CameraGrad.
-  const auto rows = [&](int64_t first, int64_t count) { return sum.narrow(0, first, 4 * count).view({count, 4}); };
-  const auto matrix = [&](Tensor first, Tensor last) {  // Rows of zeros fill the middle.
-    return at::cat({first, at::zeros({4 - first.size(0) - last.size(0), 4}, sum.options()), last}).t().contiguous();
-  };
-  if (needs[8]) grads.viewmatrix = matrix(rows(0, 3), rows(12, 0));
-  if (needs[9]) grads.projmatrix = matrix(rows(12, 2), rows(20, 1));
-  if (needs[10]) grads.campos = sum.narrow(0, 24, 3).clone();
-  if (needs[11]) grads.lens = sum.narrow(0, 27, kLensWidth).clone();
+void set_camera_grads(Backend& backend, const Tensor& parts, const std::vector<bool>& needs, Grads& grads) {
+  const at::TensorOptions options = parts.options();
+  if (needs[8]) grads.viewmatrix = at::empty({4, 4}, options);
+  if (needs[9]) grads.projmatrix = at::empty({4, 4}, options);
+  if (needs[10]) grads.campos = at::empty({3}, options);
+  if (needs[11]) grads.lens = at::empty({kLensWidth}, options);
+  backend.sum_camera_grads(parts, grads);
 }
 
 std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
@@ -93,7 +86,7 @@ std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> ne
     grads.cov3D_precomp = part_of(a, c, sums.cov3D_precomp, 2);
     grads.add = c % (cameras / batches) > 0;
     const Tensor camera = adjoint(c, in, grads);
-    if (grads.with_camera) set_camera_grads(camera, needs, grads);
+    if (grads.with_camera) set_camera_grads(*make_backend(in.means3D), camera, needs, grads);
     const std::vector<Tensor> list = list_of(grads, in.means3D);
     for (size_t k = 0; k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
   }

@@ -16,7 +16,7 @@ void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& le
 Grads make_grads(const Inputs& in, const std::vector<bool>& needs);
 
 /// `parts`: what Backend::project_vjp returned.
-void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads);
+void set_camera_grads(Backend& backend, const Tensor& parts, const std::vector<bool>& needs, Grads& grads);
 
 /// Ops return empty tensors for undefined ones.
 inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }

@@ -55,6 +55,11 @@ template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& g
   return out;
 }
 
+template <typename T> CameraGradSums<T> camera_sums_of(const Tensor& parts, const Grads& grads) {
+  return {const_pointer<T>(parts),  parts.size(0),         pointer<T>(grads.viewmatrix), pointer<T>(grads.projmatrix),
+          pointer<T>(grads.campos), pointer<T>(grads.lens)};
+}
+
 template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows) {
   ProjectedRows<T> out;
   out.means2d = const_cast<Vec2<T>*>(const_pointer<Vec2<T>>(rows.means2d));

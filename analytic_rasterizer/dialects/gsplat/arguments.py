@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,6 +71,7 @@ class Mode:
     expected: bool
 
     @classmethod
+    @lru_cache
     def of(cls, render_mode: str) -> Mode:
         """Of one of `RENDER_MODES`."""
         depth = render_mode.removeprefix("RGB").lstrip("+-")
@@ -212,9 +214,11 @@ def check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any
     _check_tensor("opacities", opacities, means, of_gaussians)
     _check_tensor("viewmats", viewmats, means, (*of_cameras, 4, 4))
     _check_tensor("Ks", Ks, means, (*of_cameras, 3, 3))
-    focal = Ks.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
-    if not Ks.is_cuda and (focal <= 0).any():  # on CUDA it would wait for the device
-        raise ValueError(f"Ks must have positive focal lengths, got {focal[focal <= 0][0].item()}")
+    if Ks.device.type == "cpu" and not torch.compiler.is_compiling():  # on CUDA it would wait for the device
+        numbers = Ks.detach().flatten().tolist()
+        for focal in (*numbers[0::9], *numbers[4::9]):
+            if focal <= 0:
+                raise ValueError(f"Ks must have positive focal lengths, got {focal}")
     return sizes
 
 
@@ -262,7 +266,9 @@ def check_signal(
         if last[0] < (degree + 1) ** 2:
             raise ValueError(f"{name} must have {(degree + 1) ** 2} harmonics of degree {degree}, got {last[0]}")
     per_camera = values.shape == shapes[1]
-    return Signal(values if per_camera else values.expand(shapes[0]), degree, per_camera)
+    if not per_camera and values.shape != shapes[0]:
+        values = values.expand(shapes[0])
+    return Signal(values, degree, per_camera)
 
 
 def check_colors(
@@ -305,6 +311,12 @@ def settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps
         return resolve_footprint(footprint)
     if (chosen := chosen_footprint()) is not None:
         return chosen
+    return _filter(rasterize_mode, eps2d)
+
+
+@lru_cache
+def _filter(rasterize_mode: str, eps2d: float) -> Footprint:
+    """gsplat's own, of a mode."""
     if rasterize_mode == "classic":
         return resolve_footprint(DILATED, dilation=eps2d)
     return resolve_footprint(COMPENSATED, variance=eps2d)
