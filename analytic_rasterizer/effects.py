@@ -279,15 +279,14 @@ def _is_integer_tensor(value) -> bool:
 
 def _times(exposure, velocity):
     """exposure * velocity: a tensor if one of the two is or holds a tensor, otherwise a list."""
-    devices = () if isinstance(velocity, torch.Tensor) else [v.device for v in velocity if isinstance(v, torch.Tensor)]
-    if devices:  # not by new_tensor below, which would drop their gradients
-        numbers = (torch.as_tensor(v, dtype=torch.float64, device=devices[0]).reshape(()) for v in velocity)
+    if not isinstance(velocity, torch.Tensor):
+        tensors = [v for v in (exposure, *velocity) if isinstance(v, torch.Tensor)]
+        if not tensors:
+            return [exposure * v for v in velocity]
+        to = {"dtype": torch.float64, "device": tensors[0].device}
+        # Numbers as fills, for which the host waits for no device.
+        numbers = (v.reshape(()).to(**to) if isinstance(v, torch.Tensor) else torch.full((), v, **to) for v in velocity)
         velocity = torch.stack(list(numbers))
     # Integers would round the other factor.
     exposure, velocity = (t.double() if _is_integer_tensor(t) else t for t in (exposure, velocity))
-    if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
-        velocity = exposure.new_tensor(velocity)
-    if isinstance(velocity, torch.Tensor):
-        exposure = exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure
-        return exposure * velocity
-    return [exposure * v for v in velocity]
+    return (exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure) * velocity

@@ -25,6 +25,7 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
+from analytic_rasterizer.activations import activate
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.optim import FusedAdam
 
@@ -173,6 +174,19 @@ def effects(device: str) -> None:
         render(device, footprint="moment:samples=4", effects=each)
 
 
+def cameras(device: str) -> None:
+    """Prepared and differentiated, with limits of lenses found on the device."""
+    ops = torch.ops.analytic_rasterizer
+    for dtype in (torch.float32, torch.float64):
+        views, intrinsics = (torch.eye(n, dtype=dtype, device=device).repeat(2, 1, 1).requires_grad_() for n in (4, 3))
+        coefficients = torch.zeros(2, 12, dtype=dtype, device=device).requires_grad_()
+        made = ops.prepare_cameras(views, intrinsics, coefficients, 60, 50, "fisheye", 0.2, 9.0)
+        sum(t[..., :26].sum() for t in made).backward()
+        numbers = made[3][0].tolist()
+        leaves = [t[0].detach().requires_grad_() for t in made[:2]]
+        ops.prepare_lens(*leaves, *[None] * 8, numbers, 50, True).sum().backward()
+
+
 def losses(device: str) -> None:
     for size in ((3, 70, 90), (1, 5, 3)):
         for dtype in (torch.float32, torch.float64):
@@ -186,17 +200,13 @@ def steps(device: str) -> None:
     for dtype in (torch.float32, torch.float64):
         numbers = {"dtype": dtype, "device": device}
         leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
-        ops = torch.ops.analytic_rasterizer
-        sum(made.sum() for made in ops.activate(*leaves, 0.3, 0.2)).backward()
-        sum(made.sum() for made in ar.apply_3d_filter(leaves[0], leaves[2], torch.rand(300, **numbers))).backward()
+        sum(made.sum() for made in activate(*leaves)).backward()
         FusedAdam(leaves).step()
         matrix = torch.eye(3, 4, **numbers).requires_grad_()
-        ops.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
+        torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
         sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
         radii = torch.ones(300, dtype=torch.int32, device=device)
-        ops.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)
-        means, normals = (torch.rand(300, 3, **numbers) for _ in range(2))
-        ops.add_noise_(means, *(leaf.detach() for leaf in leaves), normals, 0.5)
+        torch.ops.analytic_rasterizer.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)
 
 
 def training(device: str) -> None:
@@ -214,7 +224,7 @@ def training(device: str) -> None:
 PARTS = {scenes.name_of(variant): partial(footprint, footprint=variant[0], **variant[1]) for variant in scenes.VARIANTS}
 PARTS |= {"largest": partial(footprint, images=("large", "largest"), footprint="box:samples=4")}
 PARTS |= {"channels": many_channels, "pairs": too_many_pairs, "sorts": sorts, "stages": stages, "weights": weights}
-PARTS |= {"effects": effects, "losses": losses, "steps": steps, "training": training}
+PARTS |= {"cameras": cameras, "effects": effects, "losses": losses, "steps": steps, "training": training}
 
 
 def kernels_of_library() -> set[str]:

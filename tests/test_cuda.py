@@ -806,11 +806,60 @@ def test_nothing_waits_for_the_device_behind_the_back_of_torch(variant):
     assert not names & set(WAITING)
 
 
-def test_effects_of_the_camera_are_not_captured():
-    frame = frames(("box", {}), effects=ar.Effects(near=0.3))
-    captured = pytest.raises(RuntimeError, match="effects of the camera cannot be captured")
-    with captured, torch.cuda.graph(torch.cuda.CUDAGraph()):
+LENS = ar.Lens.fisheye((0.02, -0.01))
+EFFECTS = {
+    "near": lambda number: {"near": 0.3},
+    "off center": lambda number: {"off_center": True},
+    "camera gradients": lambda number: {"camera_gradients": True},
+    "lens": lambda number: {"lens": LENS},
+    "lens of a tensor": lambda number: {"lens": ar.Lens("fisheye", torch.cat([0.1 * number, number.new_zeros(11)]))},
+    "defocus": lambda number: {"defocus": ar.Defocus(0.3 * number, 2.0)},
+    "motion": lambda number: {"motion": ar.Motion(number, velocity=(0.3, 0.0, 0.1))},
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_effects_of_the_camera_do_not_wait(name, waiting_is_an_error):
+    number = torch.full((1,), 0.2, device="cuda")
+    frame = frames(("box", {}), effects=ar.Effects(**EFFECTS[name](number)))
+    waiting_is_an_error()
+    for _ in range(3):
         frame()
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_effects_of_the_camera_in_a_cuda_graph(name):
+    """A replay reads tensors of the camera as they are then."""
+    scene, settings = scenes.to(scene32(), "cuda"), scenes.settings_to(settings_for(("box", {})), "cuda")
+    number, view = torch.full((1,), 0.2, device="cuda"), settings.viewmatrix.clone()
+
+    def frame():
+        return ar.GaussianRasterizer(settings._replace(viewmatrix=view, effects=ar.Effects(**EFFECTS[name](number))))(
+            **scene
+        )[0]
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.no_grad(), torch.cuda.stream(side):
+        for _ in range(3):
+            frame()
+    torch.cuda.current_stream().wait_stream(side)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        color = frame()
+    seen = []
+    for worth, shift in ((0.2, 0.0), (0.4, 0.0), (0.4, 0.1)):
+        number.fill_(worth)
+        view.copy_(settings.viewmatrix)
+        view[..., 3, 0] += shift
+        graph.replay()
+        with torch.no_grad():
+            assert torch.equal(color, frame())
+        seen.append(color.clone())
+    assert not torch.equal(seen[1], seen[2])
+    reads_number = name in ("lens of a tensor", "defocus", "motion")
+    assert torch.equal(seen[0], seen[1]) != reads_number
 
 
 @each_path

@@ -32,7 +32,9 @@ template <class... M> double number_of_model(const std::string& name, CameraMode
   for (size_t k = 0; k < names.size(); ++k) {
     if (name == names[k]) return double(k);
   }
-  TORCH_CHECK_VALUE(false, "model must be a camera model, got ", name);
+  std::string known;
+  for (const char* one : names) known += (known.empty() ? "" : ", ") + std::string(one);
+  TORCH_CHECK_VALUE(false, "model must be one of ", known, ", got '", name, "'");
 }
 template <class... M> std::string name_of_model(double number, CameraModelList<M...>) {
   const std::array<const char*, sizeof...(M)> names = {M::kName...};
@@ -71,15 +73,14 @@ std::array<double, kDistortion + 1> key_of_lens(const Lens<double>& lens) {
   key.back() = lens.model;
   return key;
 }
-bool all_finite(const double* numbers, size_t count) {
-  return std::all_of(numbers, numbers + count, [](double x) { return std::isfinite(x); });
-}
 
 /// Raises for a lens that is no map.
 double fold_of(const Lens<double>& lens) {
   const LimitKind kind = limit_kind(lens);
   if (kind == LimitKind::kLatitude) return kPi;
-  TORCH_CHECK_VALUE(all_finite(lens.distortion, kDistortion), "every number of coefficients must be finite");
+  for (int k = 0; k < kDistortion; ++k)
+    TORCH_CHECK_VALUE(std::isfinite(lens.distortion[k]), "coefficients must be finite, got ", lens.distortion[k],
+                      " at ", k);
   static auto* folds = new Remembered<kDistortion + 1>;
   const double fold = (*folds)(key_of_lens(lens), [&] {
     const FullCamera<double> camera = bare_camera(lens);
@@ -150,6 +151,7 @@ void check(PrepareCamerasArguments& a) {
   const Lens<double> lens = lens_of(a.model, std::vector<double>(kDistortion));
   const LimitKind kind = limit_kind(lens);
   const bool has_map = kind == LimitKind::kTangent || kind == LimitKind::kAngle;
+  TORCH_CHECK_VALUE(a.far > a.near, "far must be above near, ", a.near, ", got ", a.far);
   TORCH_CHECK_VALUE(has_map == a.coefficients.has_value(), "coefficients must be given for a lens, and only then; got ",
                     a.coefficients ? "some" : "none", " for the model ", a.model);
 }
@@ -186,11 +188,10 @@ Results prepare_cameras(PrepareCamerasArguments a) {
     source.position = pointer<scalar_t>(position);
     source.out = pointer<scalar_t>(lens);
     if (count == 0) return;
+    for (int c = 0; c < source.count && a.views.is_cpu(); ++c)
+      TORCH_CHECK(typename CameraSource<scalar_t>::Inverse(source.pose(c)).det != 0,
+                  "views must be invertible, got a singular one at ", c);
     prepare(source, a.views);
-    if (a.views.is_cuda()) return;
-    for (int c = 0; c < source.count; ++c)
-      TORCH_CHECK(typename CameraSource<scalar_t>::Inverse(source.pose(c)).det != 0, "the pose of camera ", c,
-                  " is singular: its rotation has no inverse");
   });
   return {view, proj, position, lens};
 }

@@ -253,7 +253,8 @@ template <class Source> AR_HD void write_lens(const Source& source, int c, doubl
                          : kind == LimitKind::kLatitude ? latitude_reached(lens, known.height)
                                                         : reach_of(kind, fold, seen);
     lens.reach = measured(kind, reach);
-    lens.fold = kind == LimitKind::kLatitude ? 0 : measured(kind, fold);
+    // Of a lens that is no map nothing is seen.
+    lens.fold = kind == LimitKind::kLatitude ? 0 : fold > 0 ? measured(kind, fold) : -1;
   }
   auto* to = source.lens_of(c);
   const double* from = &lens.tan_half_fov.x;
