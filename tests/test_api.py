@@ -930,6 +930,11 @@ def _calls(footprint, options, device, full):
         ar.render_stages(settings, **scene)
         splats = ar.project([settings, settings], **leaves)
         image, alpha = ar.blend(splats, ar.list_tiles(splats), torch.ones(len(splats.means2d), 5, device=device))
+        one = splats.split()[0]
+        looks = dict.fromkeys(_C.SUMMARIES, True)
+        torch.ops.analytic_rasterizer.inspect(
+            list(ar.list_tiles(one).tensors), one.depths.detach(), **one.size, **looks
+        )
         (image.sum() + alpha.sum()).backward()
         offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
         ar.footprint_weight(offset.requires_grad_(), cov2d, footprint, **dict(options)).sum().backward()

@@ -63,7 +63,7 @@ Results picture_gradients(PictureArguments a) {
   for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
   needs[1] = a.mean_columns > 0;
   const std::vector<Tensor> of_scene =
-      rasterize_vjp({{dL_dimage}, scene, rendered[3].toTensorVector(), needs})[0].toTensorVector();
+      rasterize_vjp({{dL_dimage}, scene, rendered.back().toTensorVector(), needs})[0].toTensorVector();
   const std::vector<Tensor> of_parameters =
       activate_vjp({{of_scene[5], of_scene[6], of_scene[2]}, parameters, {}, {true, true, true}})[0].toTensorVector();
   std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
