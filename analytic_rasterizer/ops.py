@@ -109,6 +109,17 @@ def _state(like: torch.Tensor, a) -> list[torch.Tensor]:
     return _in_order(_C.STATE, tensors)
 
 
+def _summary(like: torch.Tensor, count: int, a) -> list[torch.Tensor]:
+    """What is wanted of SummaryTensors of csrc/torch/backend.h, as ops return it."""
+    image, ints = (1, a.image_height, a.image_width), {"dtype": torch.int32}
+    tensors = {"median": like.new_empty(image)} if a.median_depth else {}
+    tensors |= {"dominant": like.new_empty(image, **ints)} if a.dominant_index else {}
+    if a.gaussian_stats:
+        tensors |= {name: like.new_empty(count, **ints) for name in ("touched", "in_front", "dominated")}
+        tensors |= {"largest": like.new_empty(count, dtype=torch.float32), "total": like.new_empty(count)}
+    return _in_order([name for name in _C.SUMMARY if name in tensors], tensors)
+
+
 def _channels(a) -> int:
     features = 0 if a.features is None else a.features.shape[1]
     return features + (a.shs.shape[-1] if a.colors_precomp is None else a.colors_precomp.shape[1])
@@ -128,7 +139,8 @@ def _(a):
         made = like.new_empty(like.shape[0], channels + extra) if extra or a.features is not None else like.new_empty(0)
         saved = [*_lists(like, _splat_count(a), a, True), *_state(like, a), made]
     images = [like.new_empty(size) for name in _C.IMAGES if getattr(a, name)]
-    return like.new_empty(channels, *size), images, like.new_empty(like.shape[0], dtype=torch.int32), saved
+    radii = like.new_empty(like.shape[0], dtype=torch.int32)
+    return like.new_empty(channels, *size), images, radii, _summary(like, like.shape[0], a), saved
 
 
 @_register("rasterize_timed")
@@ -285,13 +297,7 @@ def _(a):
 
 @_register("inspect")
 def _(a):
-    saved, count = dict(zip(_C.LISTS, a.saved)), a.depths.shape[0]
-    ids, image = saved["ids"], (a.image_height, a.image_width)
-    tensors = {name: ids.new_empty(image) for name in ("median", "dominant")}
-    tensors |= {name: ids.new_empty(count) for name in ("touched", "in_front", "dominated")}
-    tensors["largest"] = saved["splats"].new_empty(count, dtype=torch.float32)
-    tensors["total"] = ids.new_empty(count, dtype=torch.int64)
-    return _in_order(_C.SUMMARY, tensors)
+    return _summary(a.depths, a.depths.shape[0], a)
 
 
 @_register("footprint_weight")

@@ -1,4 +1,4 @@
-"""Outputs of a rendering that the operator does not return as images: median depth and statistics; and mean depths."""
+"""What is made of the results of operators: outputs by their names, images before a background, mean depths."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from . import _C
 from .autocast import widened
 from .effects import Effects, GaussianStats
 
@@ -73,30 +72,10 @@ def before_background(color: torch.Tensor, alpha: torch.Tensor, background: torc
     return torch.cat([color[: len(background)] + behind, color[len(background) :]])
 
 
-@torch.no_grad()
-def summaries(
-    effects: Effects, saved: list[torch.Tensor], z: torch.Tensor, size: tuple[int, int], footprint: str, option: float
-) -> dict:
-    """The outputs without a gradient that `effects` asks for, by name.
-
-    Args:
-        effects: Which outputs to make.
-        saved: The tensors that the operator `rasterize` saved with keep=True.
-        z: (P,) camera-space z of the Gaussians, world units.
-        size: Height and width of the image, px.
-        footprint, option: Key and number of the footprint that it was rendered with.
-    """
-    summary = dict(zip(_C.SUMMARY, torch.ops.analytic_rasterizer.inspect(saved, z, *size, footprint, option)))
-    outputs = {}
-    if effects.median_depth:
-        median = summary["median"]
-        of_pixel = z[median.clamp_min(0).long()] if z.shape[0] else z.new_zeros(median.shape)
-        outputs["median_depth"] = of_pixel.masked_fill(median < 0, 0)[None]
-    if effects.dominant_index:
-        outputs["dominant_index"] = summary["dominant"][None]
+def named_summary(effects: Effects, summary: list[torch.Tensor]) -> dict[str, Any]:
+    """What an op returned as `summary`, by the outputs of `effects` that it was asked for."""
+    names = [name for name in ("median_depth", "dominant_index") if getattr(effects, name)]
+    outputs = dict(zip(names, summary))
     if effects.gaussian_stats:
-        sums = (summary["total"].double() * _C.WEIGHT_UNIT).to(z.dtype)
-        outputs["gaussian_stats"] = GaussianStats(
-            summary["touched"], summary["largest"], sums, summary["in_front"], summary["dominated"]
-        )
+        outputs["gaussian_stats"] = GaussianStats(*summary[len(names) :])
     return outputs

@@ -16,7 +16,7 @@ from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import NEAR, Effects, Outputs
 from .ops import Op
-from .outputs import before_background, depths, split_background, summaries
+from .outputs import before_background, depths, named_summary, split_background
 from .seam import has_seam
 from .settings import GaussianRasterizationSettings
 from .sphere import render_sphere
@@ -113,7 +113,7 @@ def render(
         outputs = settings.effects if outputs is NOTHING else outputs.with_outputs_of(settings.effects)
     debug = bool(settings.debug)
     if outputs is NOTHING and bg.dim() < 3:
-        return _rasterize(settings, **gaussians, **camera, bg=bg, debug=debug)[::2]
+        return _rasterize(settings, **gaussians, **camera, bg=bg, debug=debug)[:3:2]
     return _render_with_outputs(settings, gaussians, camera, outputs)
 
 
@@ -124,11 +124,11 @@ def _render_with_outputs(
     bg, debug = settings.bg, bool(settings.debug)
     size = camera["image_height"], camera["image_width"]
     bg, bg_image = split_background(bg, gaussians["colors_precomp"], size, debug)
-    with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
-    options = {"bg": bg, **blended, "keep": with_summaries, "debug": debug}
-    color, images, radii, saved = _rasterize(settings, **gaussians, **camera, **options)
+    summarized = {name: getattr(effects, name) for name in _C.SUMMARIES}
+    options = {"bg": bg, **blended, **summarized, "debug": debug}
+    color, images, radii, summary, _ = _rasterize(settings, **gaussians, **camera, **options)
     outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
         color = before_background(color, outputs["alpha"], bg_image)
@@ -136,10 +136,7 @@ def _render_with_outputs(
             del outputs["alpha"]
     if not effects.has_outputs:
         return color, radii
-    if with_summaries:
-        z = depths(gaussians["means3D"].detach(), camera["viewmatrix"].detach(), settings.effects)
-        outputs |= summaries(effects, saved, z, size, camera["footprint"], camera["option"])
-    return color, radii, Outputs(**outputs)
+    return color, radii, Outputs(**outputs, **named_summary(effects, summary))
 
 
 class GaussianRasterizer(torch.nn.Module):

@@ -12,7 +12,7 @@ from . import _C, advice
 from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import Effects, Outputs
-from .outputs import before_background, split_background, summaries
+from .outputs import before_background, named_summary, split_background
 from .seam import with_copies
 from .settings import check_settings, whole_number
 from .stages import blend, list_tiles, project_once
@@ -97,8 +97,7 @@ def render_sphere(
         splats = replace(splats, means2d=splats.means2d + nothing)
         sums = sums if sums_in_z or means2D.shape[1] == 4 else None
     splats, sums = with_copies(splats, turns, sums)
-    with_summaries = outputs.median_depth or outputs.dominant_index
-    lists = list_tiles(splats, keep=with_summaries or torch.is_grad_enabled())
+    lists = list_tiles(splats, keep=torch.is_grad_enabled())
 
     ids, depth = splats.gaussian_ids.long(), splats.depths[:, None]
     channels = ([splats.colors] if three else []) + [t[ids] for t in given]
@@ -115,11 +114,12 @@ def render_sphere(
         return color, radii
     made = {"alpha": alpha[0]} if outputs.alpha else {}
     made |= zip((name for name in ("depth", "inverse_depth") if getattr(outputs, name)), others)
-    if with_summaries:
-        none = [depth.new_empty(0)] * (len(_C.STATE) + 1)  # which a summary does not read
-        of_rows = summaries(
-            outputs, [*lists.tensors, *none], depth.detach()[:, 0], size, splats.footprint, splats.option
+    if outputs.median_depth or outputs.dominant_index:
+        wanted = {name: getattr(outputs, name) for name in _C.SUMMARIES}
+        summary = torch.ops.analytic_rasterizer.inspect(
+            list(lists.tensors), splats.depths.detach(), *size, splats.footprint, splats.option, **wanted
         )
+        of_rows = named_summary(outputs, summary)
         if outputs.dominant_index:
             row = of_rows["dominant_index"]
             ids = torch.cat([splats.gaussian_ids, splats.gaussian_ids.new_tensor([-1])])  # row -1: nothing

@@ -382,7 +382,7 @@ def render_stages(
     check_tensors(means3D.device, bg=settings.bg)
     size = camera["image_height"], camera["image_width"]
     bg, bg_image = split_background(settings.bg, gaussians["colors_precomp"], size)
-    color, images, radii, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
+    color, images, radii, _, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
         **gaussians, **camera, bg=bg, alpha=bg_image is not None
     )
     if bg_image is not None:

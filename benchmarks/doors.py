@@ -1,326 +1,56 @@
-"""What a frame costs by the way it is called: the drop-in, its effects, stages, gsplat's call, and gsplat's own.
+"""What a frame costs by the door through which it is rendered: drop-in, effects, stages, gsplat's call; and gsplat.
 
-    python benchmarks/doors.py SCENE --views VIEWS [--footprint box:samples=1] [--doors plain lens ...] [--cameras 1 4]
+    python benchmarks/doors.py SCENE --views VIEWS [--footprint box:samples=1] [--doors plain stages ...]
+    python benchmarks/doors.py --tiny
 
-Every door renders the first view, or with 4 cameras the views in turn, forward alone and with the backward pass of
-sum(image * w) for fixed random w. Medians over rounds in turn, in ms. On the CPU there are times only. With CUDA:
+A row is a door. All take turns, round after round, each with a call that is not timed before one that is, so that no
+row pays for the one before it; medians over rounds, averaged over views. "forward" is without gradient; "f+b" also
+computes the gradient of sum(image * w), for fixed random w, with respect to all inputs. "/base" is the ratio to the row
+"plain"; of defocus and motion to plain frames of Gaussians enlarged until there are as many pairs. Rows with * are
+gsplat's own `rasterization`, where gsplat is installed and there is a CUDA device; "/gsplat" is the ratio of our row of
+the same call to it. With "4 cameras" a call renders this view and the three that follow.
 
-- forward, f+b: the time between two events around a call on an idle device;
-- host: the time until the call has returned, which waits for nothing;
-- events: kernels, copies and memsets;
-- used, reserved: MiB of torch's allocator at the peak of forward and backward, above what the scene takes;
-- plain: the ratio to the drop-in without effects;
-- gsplat: the ratio to the same call of gsplat's own, where that is installed.
+With CUDA "ms" is between two events around a call on an idle device, and "host" until the call returns, without
+waiting. "events" are kernels, copies and fills on the device by torch's profiler. "used" and "reserved" are the peaks
+of torch's allocator over a few passes of the row alone, from an emptied cache, scene included.
 
-`--tiny` takes no scene: ten Gaussians in a picture of 16x16 px, where nothing counts but what the host does.
+--tiny is for the host's share: 10 random Gaussians of degree 1 in 32x32 pixels, on one thread of the CPU.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
-import importlib
-import importlib.util
-import statistics
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
-from common import CLOCKS, add_measuring, describe_machine, parse_size, save_json, settle
+from common import CLOCKS, add_measuring, mean_of, measure, parse, print_setup, save_json
+from effects import EffectCase, effect, lens
+from peers import find_peers
 from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import markdown_table
-from analytic_rasterizer.analysis.timing import Case
-from analytic_rasterizer.camera import view_center
-from analytic_rasterizer.dialects import gsplat as dialect
+from analytic_rasterizer.analysis.timing import WARM_UP, Case, fixed_weights, seconds_of
+from analytic_rasterizer.cli.arguments import add_scales, reduction
+from analytic_rasterizer.dialects import gsplat
+from analytic_rasterizer.effects import NEAR
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.outputs import depths
 
-DISC, STREAK = 2.0, 4.0  # px, at the median depth
-WARM_UP = 40  # calls: the first 32 frames of a size wait for the device
-RADIAL = {"pinhole": (0.02, -0.01, 0.0, 0.0, 0.0, 0.0), "fisheye": (0.02, 0.0, 0.0, 0.0)}
-
-
-class Door:
-    """A way to render: `image(with_gradient)` returns what it makes, `inputs` have the gradients."""
-
-    def __init__(self, call: Callable[..., list[torch.Tensor]], inputs: dict[str, torch.Tensor], leaves=()):
-        self.call = call
-        self.plain = inputs
-        self.inputs = {name: t.detach().clone().requires_grad_() for name, t in inputs.items()}
-        self.leaves = list(leaves)
-
-    @torch.no_grad()
-    def forward(self) -> list[torch.Tensor]:
-        return self.call(**self.plain)
-
-    def forward_backward(self) -> tuple:
-        images = [image for image in self.call(**self.inputs) if image.requires_grad]
-        weights = [_weights(image.shape, image.device) for image in images]
-        return torch.autograd.grad(images, [*self.inputs.values(), *self.leaves], weights, allow_unused=True)
+PASSES = ("forward", "forward_backward")
+TINY_ROUNDS = 500
+MEMORY_PASSES = 3
+RADIAL, TANGENTIAL = (-0.1, 0.02, 0.0, 0.0, 0.0, 0.0), (1e-3, 1e-3)  # OpenCV's coefficients
 
 
-@functools.cache
-def _weights(shape: torch.Size, device: torch.device) -> torch.Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(device)
-
-
-class Doors:
-    """All doors of a scene and its views."""
-
-    def __init__(self, scene: Gaussians, views: list[io.View], footprint: str):
-        self.scene, self.views, self.footprint = scene, views, footprint
-        self.case = Case(scene, views[0], footprint)
-        self.drop_in_inputs = scene.arguments()
-        self.of_gsplat = {
-            "means": scene.means,
-            "quats": self.drop_in_inputs["rotations"],
-            "scales": self.drop_in_inputs["scales"],
-            "opacities": self.drop_in_inputs["opacities"][:, 0].contiguous(),
-            "colors": scene.shs,
-        }
-
-    def rows(self, cameras: list[int]) -> dict[str, Callable[[], Door]]:
-        """By name, what makes a door."""
-        rows = {
-            "drop-in": self.drop_in,
-            **{name: functools.partial(self.drop_in, **{name: True}) for name in ("alpha", "depth")},
-            "near": lambda: self.drop_in(near=0.3),
-            "off_center": lambda: self.drop_in(off_center=True),
-            "camera_gradients": self.camera_gradients,
-            "lens: perspective": lambda: self.lens(ar.Lens.perspective((-0.1, 0.02), (1e-3, 1e-3))),
-            "lens: fisheye": lambda: self.lens(ar.Lens.fisheye((0.02,))),
-            "lens: coefficients as a tensor": lambda: self.lens(self._tensor_lens()),
-            "defocus": self.defocus,
-            "motion": self.motion,
-            "median_depth": lambda: self.drop_in(median_depth=True),
-            "dominant_index": lambda: self.drop_in(dominant_index=True),
-            "gaussian_stats": lambda: self.drop_in(gaussian_stats=True),
-            "stages": self.stages,
-        }
-        for count in cameras:
-            rows |= {f"gsplat {name}": make for name, make in self._of_gsplat(count).items()}
-        return rows
-
-    def drop_in(self, leaves: dict | None = None, **fields) -> Door:
-        settings = self.case.settings
-        leaves = leaves or {}
-        if fields:
-            settings = settings._replace(effects=ar.Effects(**fields))
-        rasterizer = ar.GaussianRasterizer(settings._replace(**leaves))
-
-        def call(**gaussians):
-            color, _, *outputs = rasterizer(means2D=None, **gaussians)
-            found = [color]
-            for value in outputs[0] if outputs else ():
-                found += [] if value is None else value if isinstance(value, ar.GaussianStats) else [value]
-            return found
-
-        return Door(call, self.drop_in_inputs, leaves.values())
-
-    def camera_gradients(self) -> Door:
-        names = ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")
-        given = {name: torch.as_tensor(getattr(self.case.settings, name)).to(self.scene.means) for name in names}
-        leaves = {name: value.detach().clone().requires_grad_() for name, value in given.items()}
-        return self.drop_in(leaves, camera_gradients=True)
-
-    def lens(self, lens: ar.Lens) -> Door:
-        s = self.case.settings
-        if not isinstance(lens.coefficients, torch.Tensor):
-            lens = lens.with_reach((s.tanfovx, s.tanfovy), view_center(s.viewmatrix, s.projmatrix).tolist())
-        return self.drop_in(lens=lens)
-
-    def _tensor_lens(self) -> ar.Lens:
-        numbers = ar.Lens.perspective((-0.1, 0.02), (1e-3, 1e-3)).coefficients
-        return ar.Lens("perspective", torch.tensor(numbers).to(self.scene.means))
-
-    def _seen(self) -> torch.Tensor:
-        z = depths(self.scene.means, self.case.settings.viewmatrix)
-        seen = z[z > ar.effects.NEAR]
-        return seen if len(seen) else z.new_ones(1)
-
-    def defocus(self) -> Door:
-        z, fx = self._seen(), self.views[0].fx
-        focus = z.median()
-        disc = fx * (1 / focus - 1 / z).abs().median().item()
-        return self.drop_in(defocus=ar.Defocus(DISC / disc if disc > 0 else 0.1, focus.item()))
-
-    def motion(self) -> Door:
-        speed = STREAK * self._seen().median().item() / self.views[0].fx
-        return self.drop_in(motion=ar.Motion(1.0, velocity=(speed, 0.0, 0.0)))
-
-    def stages(self) -> Door:
-        def call(**gaussians):
-            splats = ar.project(self.case.settings, **gaussians)
-            lists = ar.list_tiles(splats, keep=torch.is_grad_enabled())
-            return list(ar.blend(splats, lists)[:1])
-
-        return Door(call, self.drop_in_inputs)
-
-    def _of_gsplat(self, count: int) -> dict[str, Callable[[], Door]]:
-        variants = {
-            "packed": {},
-            "table": {"packed": False},
-            "antialiased": {"packed": False, "rasterize_mode": "antialiased"},
-            "RGB+ED": {"packed": False, "render_mode": "RGB+ED"},
-            "RGB+ED, packed": {"render_mode": "RGB+ED"},
-        }
-        if count == 1:
-            variants |= {
-                "OpenCV": {"packed": False, "radial": RADIAL["pinhole"], "tangential_coeffs": (1e-3, 1e-3)},
-                "fisheye": {"packed": False, "radial": RADIAL["fisheye"], "camera_model": "fisheye"},
-            }
-        suffix = "" if count == 1 else f", {count} cameras"
-        return {
-            f"{name}{suffix}": functools.partial(self.gsplat, dialect.rasterization, count, **options)
-            for name, options in variants.items()
-        }
-
-    def gsplat(self, rasterization: Callable, count: int, radial=None, **options) -> Door:
-        views = [self.views[k % len(self.views)] for k in range(count)]
-        like, size = self.scene.means, (views[0].width, views[0].height)
-        intrinsics = [[[v.fx, 0.0, v.middle[0]], [0.0, v.fy, v.middle[1]], [0.0, 0.0, 1.0]] for v in views]
-        poses = torch.stack([v.w2c for v in views]).to(like)
-        fixed = {"viewmats": poses, "Ks": torch.tensor(intrinsics).to(like), "sh_degree": self.scene.sh_degree}
-        fixed |= {"width": size[0], "height": size[1], "near_plane": 0.2} | options
-        for name, numbers in (("radial_coeffs", radial), ("tangential_coeffs", options.get("tangential_coeffs"))):
-            if numbers is not None:
-                fixed[name] = torch.tensor([numbers] * count).to(like)
-        if radial is not None and rasterization is not dialect.rasterization:
-            fixed["with_ut"] = True  # without which gsplat has no lenses
-        return Door(lambda **gaussians: [rasterization(**gaussians, **fixed)[0]], self.of_gsplat)
-
-
-def own_of(name: str, doors: Doors, cameras: list[int]) -> Callable[[], Door] | None:
-    """The same call of gsplat's own, where it is installed."""
-    if not name.startswith("gsplat ") or importlib.util.find_spec("gsplat") is None:
-        return None
-    for count in cameras:
-        made = doors._of_gsplat(count).get(name.removeprefix("gsplat "))
-        if made is not None:
-            own = importlib.import_module("gsplat").rasterization
-            return functools.partial(doors.gsplat, own, *made.args[1:], **made.keywords)
-    return None
-
-
-def host_seconds(call: Callable[[], object]) -> float:
-    """Until the call returns; what it queued is waited for outside."""
-    start = time.perf_counter()
-    result = call()
-    taken = time.perf_counter() - start
-    del result
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return taken
-
-
-def device_events(call: Callable[[], object]) -> int:
-    """Kernels, copies and memsets of a call."""
-    from torch.profiler import ProfilerActivity, profile
-
-    torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
-        call()
-        torch.cuda.synchronize()
-    return sum(event.device_type == torch.autograd.DeviceType.CUDA for event in profiled.events())
-
-
-def memory_of(call: Callable[[], object]) -> tuple[float, float]:
-    """MiB in use and reserved at the peak of some calls, above what is there before, in a cache that begins empty."""
-    torch.cuda.synchronize()
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    for _ in range(5):
-        call()
-    torch.cuda.synchronize()
-    used, reserved = torch.cuda.max_memory_allocated() - before, torch.cuda.max_memory_reserved() - before
-    return used / 2**20, reserved / 2**20
-
-
-def measured(doors: dict[str, Door], device: str, rounds: int) -> dict[str, dict[str, float]]:
-    """Medians by door."""
-    found: dict[str, dict[str, float]] = {}
-    for pass_ in ("forward", "forward_backward"):
-        calls = {name: getattr(door, pass_) for name, door in doors.items()}
-        for call in calls.values():
-            for _ in range(WARM_UP if device == "cuda" else 3):
-                call()
-        samples: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
-        for _ in range(rounds):
-            for name, call in calls.items():
-                call()  # alone: the room for pairs is of the frames of this door
-                samples[name].append((CLOCKS[device](call), host_seconds(call) if device == "cuda" else 0.0))
-        for name, taken in samples.items():
-            ms, host = (1e3 * statistics.median(column) for column in zip(*taken))
-            found.setdefault(name, {}).update({pass_: ms, f"{pass_} host": host})
-            if device == "cuda":
-                found[name][f"{pass_} events"] = device_events(calls[name])
-    for name, door in doors.items() if device == "cuda" else ():
-        found[name]["used"], found[name]["reserved"] = memory_of(door.forward_backward)
-    return found
-
-
-def format_table(found: dict[str, dict[str, float]], device: str) -> str:
-    """As markdown."""
-    columns = ["forward", "forward_backward"]
-    if device == "cuda":
-        columns = [f"{pass_}{of}" for pass_ in columns for of in ("", " host", " events")] + ["used", "reserved"]
-    header = ["door", *(c.replace("forward_backward", "f+b") for c in columns), "plain", "plain f+b"]
-    header += ["gsplat", "gsplat f+b"]
-    base, rows = found.get("drop-in"), []
-    for name, numbers in found.items():
-        own = found.get(f"{name} (its own)")
-        row = [name, *(numbers[c] for c in columns)]
-        for other in (base, own):
-            row += [numbers[p] / other[p] if other else "" for p in ("forward", "forward_backward")]
-        rows.append(row)
-    return markdown_table(header, rows)
-
-
-def tiny_scene() -> tuple[Gaussians, list[io.View]]:
-    """Ten Gaussians of degree 1, and a view of 16x16 px."""
-    random = functools.partial(torch.randn, generator=torch.Generator().manual_seed(0))
-    scene = Gaussians.from_activated(
-        means=random(10, 3), scales=0.1 * random(10, 3).exp(), rotations=random(10, 4),
-        opacities=random(10, 1).sigmoid(), shs=random(10, 4, 3),
-    )  # fmt: skip
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[2, 3] = 5.0
-    return scene, [io.View("tiny", 16, 16, 20.0, 20.0, pose)]
-
-
-def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    add = parser.add_argument
-    add("scene", nargs="?", help="trained scene, or an .npz (see scene_files.py)")
-    add("--views", help="file of views")
-    add("--tiny", action="store_true", help="ten Gaussians instead of a scene")
-    add("--footprint", default="box:samples=1", help="of all doors but gsplat's (default: %(default)s)")
-    add("--doors", nargs="+", metavar="NAME", help="whose names begin so (default: all)")
-    add("--cameras", nargs="+", type=int, default=[1, 4], help="of gsplat's call (default: 1 4)")
-    add("--size", type=parse_size, help="of the pictures, WIDTHxHEIGHT")
-    add_measuring(parser)
-    args = parser.parse_args()
-    if not args.tiny and not (args.scene and args.views):
-        parser.error("expected a scene and --views, or --tiny")
-    settle(parser, args)
-    torch.set_num_threads(args.threads)
-    return args
-
-
-def chosen(args: argparse.Namespace, doors: Doors) -> Iterator[tuple[str, Door]]:
-    """The doors, and beside those of gsplat's call gsplat's own."""
-    for name, make in doors.rows(args.cameras).items():
-        if args.doors and not any(name.startswith(start) for start in args.doors):
-            continue
-        yield name, make()
-        own = own_of(name, doors, args.cameras) if args.device == "cuda" else None
-        if own is not None:
-            yield f"{name} (its own)", own()
+class Door(NamedTuple):
+    make: Callable[[Gaussians, list[io.View], int, str], Case]
+    """Of a scene, views, the number of one of them, and a footprint."""
+    base: str = "plain"
+    peer: str | None = None
+    """The row of gsplat's own call."""
 
 
 def main() -> None:
@@ -328,21 +58,248 @@ def main() -> None:
     if args.tiny:
         scene, views = tiny_scene()
     else:
-        scene, views = load_scene(args.scene), io.load_views(args.views)
-    if args.size:
-        views = [view.resized(*args.size) for view in views]
-    doors = Doors(scene.to(args.device), views, args.footprint)
-    print(f"{len(scene.means)} Gaussians, {views[0].width}x{views[0].height}, {describe_machine(args.device)}")
-    made = dict(chosen(args, doors))
-    for name, door in list(made.items()):  # what is not there is left out, not the rest of the table
-        try:
-            door.forward()
-        except (NotImplementedError, AssertionError, TypeError, ValueError, RuntimeError) as error:
-            print(f"{name}: left out: {error}", file=sys.stderr)
-            del made[name]
-    found = measured(made, args.device, args.rounds)
-    print(format_table(found, args.device))
-    save_json(args, {"doors": found})
+        views = [view.scaled(1 / args.scales) for view in io.load_views(args.views)[: args.limit_views]]
+        scene = load_scene(args.scene).to(args.device)
+    print_setup(scene, views, args.device)
+    doors = DOORS | (PEERS if find_peers(["gsplat"], args.device) else {})
+    chosen = {name: door for name, door in doors.items() if name == "plain" or is_chosen(name, doors, args.doors)}
+    cases = {
+        name: [door.make(scene, views, i, args.footprint) for i in range(len(views))] for name, door in chosen.items()
+    }
+    measured = measure(cases, partial(time_round, device=args.device), args.device, args.rounds)
+    results = {name: mean_of(per_view) for name, per_view in measured.items()}
+    if args.device == "cuda":
+        for name, of_door in cases.items():
+            results[name] |= count_events(of_door) | peak_memory(of_door)
+    print(f"\n`{args.footprint}`\n\n{format_results(results, chosen, args.device)}")
+    save_json(args, {"results": results})
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    add = parser.add_argument
+    add("scene", nargs="?", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
+    add("--views", help="file of views")
+    add("--limit-views", type=int, help="use only so many of them")
+    add_scales(parser, reduction, "of the views: 2 is half the size (default: 1)", 1.0)
+    add("--tiny", action="store_true", help="a tiny random scene on one thread of the CPU instead")
+    add("--footprint", default="box:samples=1", metavar="NAME[:k=v]", help="not of gsplat's call (%(default)s)")
+    add("--doors", nargs="+", choices=list(DOORS), default=list(DOORS), metavar="ROW", help=", ".join(DOORS))
+    add_measuring(parser)
+    given = parser.parse_args()
+    if given.tiny == (given.scene is not None) or given.tiny == (given.views is not None):
+        parser.error("either a scene and --views, or --tiny")
+    if given.tiny:
+        parser.set_defaults(device="cpu", threads=1, rounds=TINY_ROUNDS)
+        if parser.parse_args().device == "cuda":
+            parser.error("--tiny: runs on the CPU")
+    return parse(parser)
+
+
+def is_chosen(name: str, doors: dict[str, Door], chosen: list[str]) -> bool:
+    """Whether a row is asked for, or another needs it."""
+    return name in chosen or any(name in (doors[other].base, doors[other].peer) for other in chosen)
+
+
+def tiny_scene() -> tuple[Gaussians, list[io.View]]:
+    generator = torch.Generator().manual_seed(0)
+    rand = partial(torch.rand, generator=generator)
+    scene = Gaussians.from_activated(
+        means=2 * rand(10, 3) - 1 + torch.tensor([0.0, 0.0, 4.0]),
+        scales=0.05 + 0.2 * rand(10, 3),
+        rotations=rand(10, 4) - 0.5,
+        opacities=0.5 + 0.4 * rand(10, 1),
+        shs=rand(10, 4, 3) - 0.5,
+    )
+    return scene, [io.View("tiny", 32, 32, 32.0, 32.0, torch.eye(4))]
+
+
+# ------------------------------------------------------------------------------------------ what is measured
+
+
+def time_round(case: Case, device: str) -> dict[str, float]:
+    """Seconds of both passes; with CUDA also until their calls return."""
+    result = {}
+    for name in PASSES:
+        call = getattr(case, name)
+        call()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        result[name] = CLOCKS[device](call)
+        if device == "cuda":
+            result[f"host_{name}"] = seconds_of(call)
+            torch.cuda.synchronize()
+    return result
+
+
+def count_events(cases: list[Case]) -> dict[str, float]:
+    """Kernels, copies and fills on the device in a pass, over the cases."""
+    activities = [torch.profiler.ProfilerActivity.CUDA]
+    result = {}
+    for name in PASSES:
+        for case in cases:  # what follows other doors may wait for the device, and copies then
+            for _ in range(WARM_UP):
+                getattr(case, name)()
+        torch.cuda.synchronize()
+        with torch.profiler.profile(activities=activities) as profiler:
+            for case in cases:
+                getattr(case, name)()
+            torch.cuda.synchronize()
+        on_device = [e for e in profiler.events() if e.device_type == torch.autograd.DeviceType.CUDA]
+        result[f"events_{name}"] = len(on_device) / len(cases)
+    return result
+
+
+def peak_memory(cases: list[Case]) -> dict[str, float]:
+    """Bytes that torch's allocator has in use and reserves, at most."""
+    torch.cuda.synchronize()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    for _ in range(MEMORY_PASSES):
+        for case in cases:
+            case.forward()
+            case.forward_backward()
+    torch.cuda.synchronize()
+    return {"used": torch.cuda.max_memory_allocated(), "reserved": torch.cuda.max_memory_reserved()}
+
+
+def format_results(results: dict[str, dict], doors: dict[str, Door], device: str) -> str:
+    on_cuda = device == "cuda"
+    header = ["door", "forward ms", "/base", "/gsplat", "f+b ms", "/base", "/gsplat"]
+    header += ["host ms", "f+b", "events", "f+b", "used MiB", "reserved MiB"] if on_cuda else []
+    rows = []
+    for name, result in results.items():
+        row, base, peer = [name], results[doors[name].base], results.get(doors[name].peer)
+        for key in PASSES:
+            row += [1e3 * result[key], result[key] / base[key], result[key] / peer[key] if peer else None]
+        if on_cuda:
+            row += [1e3 * result[f"host_{key}"] for key in PASSES] + [result[f"events_{key}"] for key in PASSES]
+            row += [result[key] / 2**20 for key in ("used", "reserved")]
+        rows.append(row)
+    return markdown_table(header, rows)
+
+
+# -------------------------------------------------------------------------------------------------- doors
+
+
+def drop_in(change: Callable[[EffectCase], EffectCase]) -> Callable:
+    return lambda scene, views, i, footprint: change(EffectCase(scene, views, views[i], footprint))
+
+
+class StagesCase(Case):
+    """Three calls in place of one."""
+
+    def __init__(self, scene: Gaussians, views: list[io.View], i: int, footprint: str):
+        super().__init__(scene, views[i], footprint)
+        del self.inputs["means2D"]  # which `project` does not take
+
+    def image(self, means3D, means2D=None, **gaussians) -> torch.Tensor:
+        splats = ar.project(self.settings, means3D, **gaussians)
+        return ar.blend(splats, ar.list_tiles(splats, keep=torch.is_grad_enabled()))[0][0]
+
+
+class CallCase(Case):
+    """gsplat's call, of this package or of gsplat."""
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        views: list[io.View],
+        i: int,
+        _: str,
+        own: bool,
+        cameras: int = 1,
+        coefficients: bool = False,
+        **options: Any,
+    ):
+        super().__init__(scene, views[i], "point")
+        del self.inputs["means2D"]
+        self.rasterization = gsplat.rasterization
+        if not own:
+            from gsplat import rasterization
+
+            self.rasterization = rasterization
+        of_size = [v for v in views[i:] + views[:i] if (v.width, v.height) == (views[i].width, views[i].height)]
+        used = [of_size[k % len(of_size)] for k in range(cameras)]
+        intrinsics = [[[v.fx, 0.0, v.middle[0]], [0.0, v.fy, v.middle[1]], [0.0, 0.0, 1.0]] for v in used]
+        self.fixed = {
+            "viewmats": torch.stack([v.w2c for v in used]).to(scene.means),
+            "Ks": torch.tensor(intrinsics).to(scene.means),
+            "width": views[i].width,
+            "height": views[i].height,
+            "sh_degree": scene.sh_degree,
+            "near_plane": NEAR,
+            "packed": False,
+            **options,
+        }
+        if coefficients:
+            rows = {"radial_coeffs": RADIAL, "tangential_coeffs": TANGENTIAL}
+            self.fixed |= {name: scene.means.new_tensor([row] * cameras) for name, row in rows.items()}
+            self.fixed["with_ut"] = True  # which gsplat demands
+
+    def image(self, means3D, opacities, shs, scales, rotations, means2D=None) -> torch.Tensor:
+        return self.rasterization(means3D, rotations, scales, opacities[:, 0], shs, **self.fixed)[0]
+
+    def forward_backward(self) -> list[torch.Tensor]:
+        images = self.image(**self.inputs)
+        c, h, w, channels = images.shape
+        weights = fixed_weights(w, channels, images.device, c * h).view(images.shape)
+        return [images, *torch.autograd.grad(images, list(self.inputs.values()), weights)]
+
+
+def as_large(changed: Callable[[EffectCase], EffectCase]) -> Callable[[EffectCase], EffectCase]:
+    """A plain frame whose Gaussians are enlarged, all alike, until it has as many pairs as the changed one."""
+
+    def change(case: EffectCase) -> EffectCase:
+        def pairs(of: EffectCase) -> int:
+            return len(ar.render_stages(of.settings, **of.gaussians).pairs)
+
+        make = partial(EffectCase, case.scene, case.views, case.view, str(case.settings.footprint))
+        wanted, low, high = pairs(changed(make())), 0.0, 6.0  # octaves
+        for _ in range(10):
+            middle = (low + high) / 2
+            few = pairs(make().change({"scale_modifier": 2**middle})) < wanted
+            low, high = (middle, high) if few else (low, middle)
+        return case.change({"scale_modifier": 2 ** ((low + high) / 2)})
+
+    return change
+
+
+CALLS = {
+    "": {},
+    " packed": {"packed": True},
+    " antialiased": {"rasterize_mode": "antialiased"},
+    " RGB+ED": {"render_mode": "RGB+ED"},
+    " packed RGB+ED": {"packed": True, "render_mode": "RGB+ED"},
+    " 4 cameras": {"cameras": 4},
+    " 4 cameras packed": {"cameras": 4, "packed": True},
+    " 4 cameras RGB+ED": {"cameras": 4, "render_mode": "RGB+ED"},
+    " OpenCV": {"coefficients": True},
+    " fisheye": {"camera_model": "fisheye"},
+}
+"""What follows "gsplat" in the name of a row, and options of `CallCase`."""
+
+DOORS = {
+    "plain": Door(drop_in(EffectCase.plain)),
+    "alpha": Door(drop_in(effect(alpha=True))),
+    "depth": Door(drop_in(effect(depth=True))),
+    "near": Door(drop_in(effect(near=1.001 * NEAR))),
+    "camera_gradients": Door(drop_in(EffectCase.camera_gradients)),
+    "off_center": Door(drop_in(effect(off_center=True))),
+    "lens:perspective": Door(drop_in(lens(ar.Lens.perspective(RADIAL[:2], TANGENTIAL)))),
+    "lens:fisheye": Door(drop_in(lens(ar.Lens.fisheye((0.02,))))),
+    "plain, as defocus": Door(drop_in(as_large(EffectCase.defocus))),
+    "defocus": Door(drop_in(EffectCase.defocus), "plain, as defocus"),
+    "plain, as motion": Door(drop_in(as_large(EffectCase.motion))),
+    "motion": Door(drop_in(EffectCase.motion), "plain, as motion"),
+    "median_depth": Door(drop_in(effect(median_depth=True))),
+    "stages": Door(StagesCase),
+    **{
+        f"gsplat{name}": Door(partial(CallCase, own=True, **options), peer=f"gsplat*{name}")
+        for name, options in CALLS.items()
+    },
+}
+PEERS = {f"gsplat*{name}": Door(partial(CallCase, own=False, **options)) for name, options in CALLS.items()}
 
 
 if __name__ == "__main__":

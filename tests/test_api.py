@@ -932,6 +932,11 @@ def _calls(footprint, options, device, full):
         ar.render_stages(settings, **scene)
         splats = ar.project([settings, settings], **leaves)
         image, alpha = ar.blend(splats, ar.list_tiles(splats), torch.ones(len(splats.means2d), 5, device=device))
+        one = splats.split()[0]
+        looks = dict.fromkeys(_C.SUMMARIES, True)
+        torch.ops.analytic_rasterizer.inspect(
+            list(ar.list_tiles(one).tensors), one.depths.detach(), **one.size, **looks
+        )
         (image.sum() + alpha.sum()).backward()
         of_rows = [t.detach().requires_grad_() for t in (splats.means2d, splats.cov2d, splats.opacities)]
         table = torch.ones(len(splats.means2d), 4 if full else 3, device=device, requires_grad=True)

@@ -18,6 +18,7 @@ import pages
 import pytest
 import scenes
 import torch
+from capture_files import circle, write_nerf_synthetic
 from conftest import ROOT, python_path
 from processes import DEADLINE
 
@@ -107,6 +108,52 @@ def test_speed(device, small_scene, monkeypatch, capsys):
         assert all(math.isfinite(value) for value in result.values())
         assert min(result["forward"], result["forward_backward"], result["pairs"]) > 0
         assert len(written["per_view"][name]) == 2
+
+
+def check_doors(text, doors, path, rows):
+    """A row for each, with numbers in all columns but those of gsplat."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    results = json.loads(path.read_text())["results"]
+    assert [line.split("|")[1].strip() for line in lines] == list(results) == rows
+    for line, (name, result) in zip(lines, results.items()):
+        assert all(math.isfinite(value) for value in result.values())
+        assert min(result["forward"], result["forward_backward"]) > 0
+        base = results[doors.DOORS[name].base if name in doors.DOORS else "plain"]
+        assert float(line.split("|")[3]) == pytest.approx(result["forward"] / base["forward"], rel=1e-3)
+    return results
+
+
+def test_doors(device, small_scene, monkeypatch, capsys):
+    """Every row, beside gsplat where it is; calls with the same options make the same images."""
+    doors = importlib.import_module("doors")
+    calls = add_peers(monkeypatch)
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
+    options = ["--rounds", "1", "--threads", "1", "--limit-views", "1", "--scales", "2", "--device", device]
+    monkeypatch.setattr(sys, "argv", ["doors.py", *map(str, arguments), *options])
+    doors.main()
+    rows = [*doors.DOORS, *doors.PEERS]
+    results = check_doors(capsys.readouterr().out, doors, small_scene / "out.json", rows)
+    assert device == "cpu" or all(result["events_forward"] > 0 for result in results.values())
+    for options in doors.CALLS.values():  # gsplat's own function was called with the options of each row
+        wanted = {name: value for name, value in options.items() if name not in ("cameras", "coefficients")}
+        wanted |= {"with_ut": True} if "coefficients" in options else {}
+        found = [kwargs for _, kwargs in calls if wanted.items() <= kwargs.items()]
+        assert any(len(kwargs["Ks"]) == options.get("cameras", 1) for kwargs in found)
+
+
+def test_doors_of_a_tiny_scene(small_scene, monkeypatch, capsys):
+    """Needs no files, and rows that others are compared with are there too."""
+    doors = importlib.import_module("doors")
+    options = ["--tiny", "--rounds", "2", "--doors", "defocus", "gsplat", "--json", str(small_scene / "out.json")]
+    monkeypatch.setattr(sys, "argv", ["doors.py", *options])
+    doors.main()
+    out = capsys.readouterr().out
+    assert "10 Gaussians of SH degree 1, 1 views of 32x32" in out and ", 1 threads," in out
+    check_doors(out, doors, small_scene / "out.json", ["plain", "plain, as defocus", "defocus", "gsplat"])
+    monkeypatch.setattr(sys, "argv", ["doors.py", "scene.ply", *options])
+    with pytest.raises(SystemExit):
+        doors.main()
+    assert "either a scene and --views, or --tiny" in capsys.readouterr().err
 
 
 class OfficialSettings(NamedTuple):
@@ -421,6 +468,33 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert training.main() == 2  # before anything is trained
     assert capsys.readouterr().err == f"error: {tmp_path}: there are no test pictures\n"
+
+
+def test_gsplat_training(tmp_path, monkeypatch, capsys):
+    """Its strategy grows Gaussians from our call, and the error of the pictures falls; what is missing is said."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    program = importlib.import_module("gsplat_training")
+    arguments = [str(tmp_path), "--device", "cpu", "--random-points", "300", "--json", str(tmp_path / "out.json")]
+    monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments])
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "gsplat", None)
+        assert program.main() == 2
+    assert capsys.readouterr().err.startswith("error: gsplat, whose strategy this runs, is not installed")
+    pytest.importorskip("gsplat", reason="needs gsplat")
+    pytest.importorskip("PIL.Image", reason="needs the train extra")
+    pytest.importorskip("scipy", reason="needs the train extra")
+    monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, "--rasterizer", "gsplat"])
+    assert program.main() == 2 and capsys.readouterr().err == "error: --rasterizer gsplat: needs CUDA\n"
+    write_nerf_synthetic(tmp_path, circle(3), circle(2))
+    found = {}
+    for steps, options in ((1, []), (60, []), (20, ["--packed", "--absgrad", "--antialiased"])):
+        options = [*options, "--iterations", str(steps), "--refine-start", "5", "--refine-every", "10"]
+        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, *options])
+        assert program.main() == 0
+        [header, row] = capsys.readouterr().out.splitlines()[1:]
+        assert header.split()[:4] == ["rasterizer", "seconds", "PSNR", "Gaussians"] and row.split()[0] == "ours"
+        found[steps] = json.loads((tmp_path / "out.json").read_text())["runs"]["ours"]
+    assert found[60]["psnr"] > found[1]["psnr"] and found[60]["gaussians"] != found[1]["gaussians"] == 300
 
 
 def run_on_ranks(name, small_scene, *options):

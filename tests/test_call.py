@@ -26,23 +26,23 @@ def arguments_of_op(device):
 
 
 def results_and_gradients(op, arguments):
-    color, images, radii, saved = op(**arguments)
+    color, images, radii, summary, saved = op(**arguments)
     gradients = [t for t in arguments.values() if torch.is_tensor(t) and t.requires_grad]
-    return [color, *images, radii, *torch.autograd.grad(color.square().sum(), gradients)], len(saved)
+    return [color, *images, radii, *summary, *torch.autograd.grad(color.square().sum(), gradients)], len(saved)
 
 
 def test_it_is_the_op(device):
     arguments = arguments_of_op(device)
-    arguments |= {"alpha": True, "depth": True}
+    arguments |= {"alpha": True, "depth": True, "median_depth": True, "gaussian_stats": True}
     made, saved = results_and_gradients(_C.Call("rasterize"), arguments)
     expected, expected_saved = results_and_gradients(torch.ops.analytic_rasterizer.rasterize, arguments)
     assert len(made) == len(expected)
     assert all(torch.equal(a, b) for a, b in zip(made, expected))
     assert saved == expected_saved > 0
     with torch.no_grad():
-        color, images, _, saved = _C.Call("rasterize")(**arguments)
+        color, images, _, summary, saved = _C.Call("rasterize")(**arguments)
     assert torch.equal(color, expected[0])
-    assert len(images) == 2
+    assert (len(images), len(summary)) == (2, 6)
     assert saved == []
     assert not color.requires_grad
 

@@ -1,6 +1,8 @@
 """The command line: what it writes, what it prints, and how it fails."""
 
+import argparse
 import errno
+import importlib
 import json
 import os
 import re
@@ -19,6 +21,7 @@ from processes import DEADLINE, run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
+from analytic_rasterizer.cli import arguments as arguments_of_commands
 from analytic_rasterizer.gaussians import Gaussians
 
 pytest.importorskip("gsply", reason="needs the cli extra")
@@ -509,3 +512,40 @@ def test_shared_views(tmp_path, plant):
         # The mean radiance of the integrated plant is 0.0300, averaged over the views.
     mean = np.mean([np.asarray(image.open(tmp_path / name)).mean() for name in names]) / 255
     assert mean == pytest.approx(0.0300, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    "version, name", [("2.4.1", "PYTORCH_CUDA_ALLOC_CONF"), ("2.9.1+cu128", "PYTORCH_CUDA_ALLOC_CONF"),
+                      ("2.10.0", "PYTORCH_ALLOC_CONF"), ("2.14.0.dev2026", "PYTORCH_ALLOC_CONF")],
+)  # fmt: skip
+def test_memory_of_cuda_is_mapped_by_pages_unless_the_user_has_said_how(version, name, monkeypatch):
+    for other in arguments_of_commands.ALLOCATOR_VARIABLES:
+        monkeypatch.setenv(other, "")  # so that it is as before in the end
+        monkeypatch.delenv(other)
+    monkeypatch.setattr(torch, "__version__", version)
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    arguments_of_commands.use_expandable_segments()
+    assert name not in os.environ
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    for given in arguments_of_commands.ALLOCATOR_VARIABLES:
+        with monkeypatch.context() as said:
+            said.setenv(given, "expandable_segments:False")
+            arguments_of_commands.use_expandable_segments()
+            assert [v for v in arguments_of_commands.ALLOCATOR_VARIABLES if v in os.environ] == [given]
+    arguments_of_commands.use_expandable_segments()
+    assert os.environ[name] == "expandable_segments:True"
+    assert sum(other in os.environ for other in arguments_of_commands.ALLOCATOR_VARIABLES) == 1
+
+
+@pytest.mark.parametrize("command", ["train", "view", "evaluate"])
+def test_commands_that_run_for_long_map_memory_by_pages(command, monkeypatch):
+    """Before they do anything else; the library never does."""
+    module = importlib.import_module(f"analytic_rasterizer.cli.{command}")
+
+    def stop():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "use_expandable_segments", stop)
+    with pytest.raises(KeyboardInterrupt):
+        module.run(argparse.Namespace())

@@ -358,6 +358,27 @@ def test_looks_match_the_weights(device, best, variant):
     assert (in_front > 0).any() and (in_front < stats.pixels.cpu()[order]).any()
 
 
+@each_kind
+def test_looks_do_not_depend_on_each_other(device, best, variant):
+    """What is left out lets a pixel be closed earlier, and changes no bit."""
+    footprint, options = variant
+    scene = scenes.cast(scenes.random_scene(16, 300, degree=1, sigma=(0.05, 0.6)), best, device)
+    looks = ("median_depth", "dominant_index", "gaussian_stats")
+
+    def outputs(*names):
+        effects = ar.Effects(**dict.fromkeys(names, True))
+        settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
+        return ar.GaussianRasterizer(settings)(**scene)[2]
+
+    together = outputs(*looks)
+    assert (together.median_depth > 0).any() and (together.median_depth == 0).any()
+    for some in (*((name,) for name in looks), looks[:2], looks[1:]):
+        found = outputs(*some)
+        for name in some:
+            a, b = getattr(found, name), getattr(together, name)
+            assert all(map(torch.equal, a, b)) if name == "gaussian_stats" else torch.equal(a, b), name
+
+
 def test_looks_do_not_depend_on_threads_or_runs():
     scene = scenes.random_scene(15, 200, degree=1)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)

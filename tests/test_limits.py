@@ -15,6 +15,7 @@ from conftest import run_python
 from scenes import Camera
 
 import analytic_rasterizer as ar
+from analytic_rasterizer import _C
 
 OPS = torch.ops.analytic_rasterizer
 ROWS = {"cpu": 2**31, "cuda": 2**30}  # the first number of Gaussians that cannot be numbered
@@ -78,13 +79,16 @@ def test_pixels_of_a_gaussian_that_cannot_be_counted(device):
     scene = scenes.to(scenes.cast(scenes.random_scene(0, 3), torch.float32), device)
     settings = Camera(sh_degree=0).settings(torch.float32, device, footprint="mip")
     footprint = {"footprint": settings.footprint.key, "option": settings.footprint.option}
-    given = {**scene, **settings._asdict(), **footprint, "keep": True}
+    given = {**scene, **settings._asdict(), **footprint, "gaussian_stats": True, "keep": True}
     names = [argument.name for argument in OPS.rasterize.default._schema.arguments]
     defaults = {"lens": None, "colors_precomp": None, "cov3D_precomp": None, "shs": None}
-    *_, saved = OPS.rasterize(**{name: value for name, value in (defaults | given).items() if name in names})
-    OPS.inspect(saved, scene["means3D"][:, 2], settings.image_height, settings.image_width, **footprint)
+    arguments = {name: value for name, value in (defaults | given).items() if name in names}
+    lists, z = OPS.rasterize(**arguments)[-1][: len(_C.LISTS)], scene["means3D"][:, 2]
+    OPS.inspect(lists, z, settings.image_height, settings.image_width, **footprint, gaussian_stats=True)
     with pytest.raises(ValueError, match=rf"fewer than {2**31} pixels, got 65536 x 32768"):
-        OPS.inspect(saved, scene["means3D"][:, 2], 2**16, 2**15, **footprint)
+        OPS.inspect(lists, z, 2**16, 2**15, **footprint, gaussian_stats=True)
+    with pytest.raises(ValueError, match=rf"fewer than {2**31} pixels, got 65536 x 32768"):
+        OPS.rasterize(**arguments | {"image_height": 2**16, "image_width": 2**15})
 
 
 def test_too_many_images_for_a_loss(device):

@@ -59,6 +59,9 @@ def rasterize(device, variant, count, full):
     if full:
         settings = settings._replace(viewmatrix=settings.viewmatrix.clone().requires_grad_())
     scene = scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device)
+    for looks in ({"median_depth": True}, {"dominant_index": True}, {"gaussian_stats": True}):
+        some = settings._replace(effects=replace(effects, **(dict.fromkeys(_C.SUMMARIES, False) | looks)))
+        ar.GaussianRasterizer(some)(**scene)
     for columns in (3, 4):
         leaves = scenes.leaves(scene | {"means2D": torch.zeros(count, columns, device=device)})
         color, _, outputs = ar.GaussianRasterizer(settings)(**leaves)
@@ -75,7 +78,9 @@ def stages(device, variant, count):
     scene = scenes.leaves(scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device))
     del scene["means2D"]
     splats = ar.project([settings, settings], **scene)
-    n = len(splats.means2d)
+    n, one = len(splats.means2d), splats.split()[0]
+    looks = dict.fromkeys(_C.SUMMARIES, True)
+    torch.ops.analytic_rasterizer.inspect(list(ar.list_tiles(one).tensors), one.depths.detach(), **one.size, **looks)
     for channels in (2, 5, 40):
         features = torch.ones(n, channels, device=device, requires_grad=True)
         absolute = torch.zeros(n, 2, device=device, requires_grad=True)

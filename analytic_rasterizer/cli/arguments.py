@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import sys
 import tempfile
@@ -26,6 +27,7 @@ from .launch import report
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError, FloatingPointError)
 VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
 LARGER = "larger numbers in --scales make them smaller"
+ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF")
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 """What `--help` shows for a value, by its type."""
 
@@ -167,6 +169,19 @@ def use_machine(args) -> None:
         args.device = "cuda" if torch.cuda.is_available() and _C.has_cuda else "cpu"
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: no CUDA device that this torch can use")
+
+
+def use_expandable_segments() -> None:
+    """Tells torch's CUDA allocator to map memory page by page, unless the user has told it anything by a variable.
+
+    Buffers of frames have many sizes, for each of which it would reserve a block of its own. Does nothing where CUDA is
+    in use already. torch 2.9 knows the newer name, and ignores it.
+    """
+    if any(name in os.environ for name in ALLOCATOR_VARIABLES) or torch.cuda.is_initialized():
+        return
+    if sys.platform == "linux":  # elsewhere torch warns that it cannot
+        version = tuple(int(number) for number in torch.__version__.split(".")[:2])
+        os.environ[ALLOCATOR_VARIABLES[version < (2, 10)]] = "expandable_segments:True"
 
 
 def writable_folder(path: str) -> Path:

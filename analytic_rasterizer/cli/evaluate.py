@@ -23,6 +23,7 @@ from .arguments import (
     add_scales,
     color,
     count,
+    use_expandable_segments,
     use_machine,
     whole_number,
     whole_numbers,
@@ -70,6 +71,7 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Measures, writes the results, and prints the table."""
+    use_expandable_segments()
     use_machine(args)
     with ranks_of(args) as ranks:
         run_on(ranks, args)

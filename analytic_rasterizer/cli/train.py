@@ -29,7 +29,7 @@ from ..training.options import (
     preset_values,
 )
 from ..training.reports import process_age
-from .arguments import add_machine_options, port, use_machine, whole_numbers
+from .arguments import add_machine_options, port, use_expandable_segments, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
 
 METAVARS = {
@@ -161,6 +161,7 @@ def shown_default(value) -> str:
 
 def run(args) -> None:
     """Trains, writes the results, and prints what the test views say. Raises KeyboardInterrupt if interrupted."""
+    use_expandable_segments()
     use_machine(args)
     with ranks_of(args) as ranks:
         complete = run_on(ranks, args)

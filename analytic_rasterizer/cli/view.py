@@ -7,7 +7,15 @@ from pathlib import Path
 
 from .. import io, viewer
 from ..footprints import resolve_footprint
-from .arguments import add_files, add_footprint, add_machine_options, add_view_options, port, use_machine
+from .arguments import (
+    add_files,
+    add_footprint,
+    add_machine_options,
+    add_view_options,
+    port,
+    use_expandable_segments,
+    use_machine,
+)
 from .photographs import find_photographs
 from .scenes import say, settle_views
 
@@ -43,6 +51,7 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Serves or exports the scene."""
+    use_expandable_segments()
     if args.server:
         run_live(args)
         return

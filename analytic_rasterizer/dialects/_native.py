@@ -102,7 +102,7 @@ def rasterize_gaussians(
     )
     check_tensors(means3D.device, background=background)
     camera = camera_arguments(settings, means3D, gaussians["shs"])
-    color, _, radii, saved = torch.ops.analytic_rasterizer.rasterize(
+    color, _, radii, _, saved = torch.ops.analytic_rasterizer.rasterize(
         **gaussians, **camera, bg=background, keep=True, debug=bool(debug)
     )
     # On CUDA tiles may share lists, which then have fewer pairs.

@@ -14,7 +14,14 @@ template <typename T> struct Shown {
   bool in_front;  ///< weight > 0, and more than half of the light is left after the splat
 };
 
-template <typename T, class P> struct PixelSummary {
+/// What is looked for. Without statistics a pixel is closed as soon as nothing behind can change the answer.
+enum class Look {
+  kMedian,      ///< `median` alone
+  kImages,      ///< and `dominant`
+  kStatistics,  ///< and what add() returns
+};
+
+template <typename T, class P, Look kLook = Look::kStatistics> struct PixelSummary {
   static constexpr int S = P::kSamples;
   T transmittance[S];
   SampleState<T, P::kMoves> states[S] = {};
@@ -28,23 +35,38 @@ template <typename T, class P> struct PixelSummary {
   AR_HD bool open() const {
     bool any = false;
     for (int s = 0; s < S; ++s) any |= transmittance[s] > T(0);
-    return any;
+    if constexpr (kLook == Look::kStatistics) {
+      return any;
+    } else if constexpr (kLook == Look::kMedian) {
+      return any && median < 0;
+    } else {  // A weight is at most the light that is left, also when both are rounded.
+      return any && (median < 0 || mean_through() > largest);
+    }
   }
 
   AR_HD Shown<T> add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
-    T weight = T(0), through = T(0);
+    T weight = T(0);
     AR_UNROLL
-    for (int s = 0; s < S; ++s) {
-      weight += blend_sample<P>(terms, p, s, transmittance[s], states[s]).contribution;
-      through += abs(transmittance[s]);
-    }
+    for (int s = 0; s < S; ++s) weight += blend_sample<P>(terms, p, s, transmittance[s], states[s]).contribution;
     weight *= T(1.0 / S);
-    if (weight > largest) {
-      largest = weight;
-      dominant = id;
+    if constexpr (kLook != Look::kMedian) {
+      if (weight > largest) {
+        largest = weight;
+        dominant = id;
+      }
     }
-    if (median < 0 && weight > T(0) && through < T(0.5 * S)) median = id;
-    return {weight, weight > T(0) && through > T(0.5 * S)};
+    const T through = mean_through();
+    if (median < 0 && weight > T(0) && through < T(0.5)) median = id;
+    return {weight, weight > T(0) && through > T(0.5)};
+  }
+
+ private:
+  /// Mean over the samples of the light that is left.
+  AR_HD T mean_through() const {
+    T through = T(0);
+    AR_UNROLL
+    for (int s = 0; s < S; ++s) through += abs(transmittance[s]);
+    return through * T(1.0 / S);
   }
 };
 

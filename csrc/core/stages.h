@@ -345,13 +345,14 @@ template <typename T> struct BlendParams {
   int32_t* last;     ///< [samples, height, width] pairs of the tile up to the sample's last splat
 };
 
-/// From the pairs of every tile to statistics of pixels and Gaussians.
+/// From the pairs of every tile to statistics of pixels and Gaussians. Null: not wanted.
 template <typename T> struct InspectParams {
   const T* splats;
   TileGrid grid;
-  int32_t* median;    ///< [height, width] a Gaussian or -1, see PixelSummary
-  int32_t* dominant;  ///< [height, width]
-  // Added to, or raised (`largest`).
+  const T* depths;    ///< of splats
+  T* median;          ///< [height, width] depth of PixelSummary::median, or 0
+  int32_t* dominant;  ///< [height, width] a Gaussian or -1
+  // Added to, or raised (`largest`). All or none.
   int32_t* touched;    ///< [n] pixels that show the Gaussian
   int32_t* largest;    ///< [n] largest weight, as the bits of a float
   int64_t* units;      ///< [n] sum of weights in units of kWeightUnit

@@ -19,9 +19,9 @@ inline void atomic_max(int32_t* bits, float value) {
   }
 }
 
-template <class P, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile) {
+template <class P, Look kLook, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile) {
   const TileView view(p.grid, tile);
-  PixelSummary<T, P> pixels[kTilePixels];
+  PixelSummary<T, P, kLook> pixels[kTilePixels];
   for (int i = 0; i < kTilePixels; ++i) pixels[i].start(i % kTile < view.columns && i / kTile < view.rows);
   for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1]; ++k) {
     const int32_t j = p.lists.pairs[k], id = p.ids[j];
@@ -37,14 +37,14 @@ template <class P, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectP
         if (!(span.lo <= T(view.x0 + column) && span.hi >= T(view.x0 + column))) continue;
         auto& pixel = pixels[row * kTile + column];
         if (!pixel.open()) continue;
-        const Shown<T> shown = pixel.add(terms, {T(column), T(row)}, id);
+        const Shown<T> shown = pixel.add(terms, {T(column), T(row)}, j);
         touched += shown.weight > T(0);
         in_front += shown.in_front;
         units += weight_units(shown.weight);
         largest = max(largest, shown.weight);
       }
     }
-    if (touched == 0) continue;
+    if (kLook != Look::kStatistics || touched == 0) continue;
     __atomic_fetch_add(&p.touched[id], touched, __ATOMIC_RELAXED);
     __atomic_fetch_add(&p.in_front[id], in_front, __ATOMIC_RELAXED);
     __atomic_fetch_add(&p.units[id], units, __ATOMIC_RELAXED);
@@ -53,16 +53,20 @@ template <class P, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectP
   for (int row = 0; row < view.rows; ++row) {
     for (int column = 0; column < view.columns; ++column) {
       const int64_t i = view.pixel(p.grid, row) + column;
-      const int32_t dominant = pixels[row * kTile + column].dominant;
-      p.median[i] = pixels[row * kTile + column].median;
-      p.dominant[i] = dominant;
-      if (dominant >= 0) __atomic_fetch_add(&p.dominated[dominant], 1, __ATOMIC_RELAXED);
+      const auto& pixel = pixels[row * kTile + column];
+      const int32_t dominant = pixel.dominant < 0 ? -1 : p.ids[pixel.dominant];
+      if (p.median) p.median[i] = pixel.median < 0 ? T(0) : p.depths[pixel.median];
+      if (p.dominant) p.dominant[i] = dominant;
+      if (kLook == Look::kStatistics && dominant >= 0) __atomic_fetch_add(&p.dominated[dominant], 1, __ATOMIC_RELAXED);
     }
   }
 }
 
 template <class P, typename T> void inspect(const cpu::InspectParams<T>& p) {
-  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) { inspect_tile<P, T>(p, tile); });
+  const auto of_tile = p.touched    ? inspect_tile<P, Look::kStatistics, T>
+                       : p.dominant ? inspect_tile<P, Look::kImages, T>
+                                    : inspect_tile<P, Look::kMedian, T>;
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) { of_tile(p, tile); });
 }
 
 }  // namespace ar::AR_ISA

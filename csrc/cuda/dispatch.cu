@@ -56,7 +56,10 @@ void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
   visit_pixels(footprint, [&](auto f) {
     using F = decltype(f);
     with_tile_side<F>(p.grid, [&](auto side) {
-      launch(inspect_kernel<F, side>, {unsigned(p.grid.tiles()), kInspectThreads<side>}, stream, p);
+      const auto kernel = p.touched    ? inspect_kernel<F, side, Look::kStatistics>
+                          : p.dominant ? inspect_kernel<F, side, Look::kImages>
+                                       : inspect_kernel<F, side, Look::kMedian>;
+      launch(kernel, {unsigned(p.grid.tiles()), kInspectThreads<side>}, stream, p);
     });
   });
 }

@@ -17,9 +17,17 @@ enum class Counting {
   kAlways,
 };
 
+/// A number as large, or larger by at most an eighth: one of eight in each octave. Buffers of few sizes are used again
+/// by torch's allocator, which else keeps a block for every size.
+inline int64_t in_steps(int64_t number) {
+  int64_t step = 1;
+  while (number > 16 * step) step *= 2;
+  return (number + step - 1) / step * step;
+}
+
 /// A guess from earlier frames of a class of images. Too little room is slow, not wrong. The first frames are counted;
-/// later frames get the room of the largest frame so far and a reserve. More Gaussians or tiles than ever seen enlarge
-/// it in proportion. EmitParams needs room for a pair of every Gaussian.
+/// later frames get the room of the largest frame so far and a reserve, in steps. More Gaussians or tiles than ever
+/// seen enlarge it in proportion. EmitParams needs room for a pair of every Gaussian.
 class PairGuess {
  public:
   /// Room for frame `frame`, at most `most`; 0: count its pairs.
@@ -28,7 +36,8 @@ class PairGuess {
     if (counting == Counting::kIfNeeded && to_count_ > 0) return 0;
     const double pairs = double(largest_.pairs) * growth(gaussians, largest_.gaussians) * growth(tiles, largest_.tiles);
     const double room = std::max(kRoomPerPair * pairs, kRoomPerGaussian * double(gaussians)) + kReservedRoom;
-    recent_[frame % kRecent] = {frame, {gaussians, tiles}, room < double(most) ? int64_t(room) : most};
+    const int64_t stepped = room < double(most) ? std::min(in_steps(int64_t(room)), most) : most;
+    recent_[frame % kRecent] = {frame, {gaussians, tiles}, stepped};
     return recent_[frame % kRecent].room;
   }
 

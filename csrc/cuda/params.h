@@ -148,6 +148,9 @@ struct BlendParams : ar::BlendParams<float> {
 /// From lists to statistics of pixels and Gaussians.
 struct InspectParams : ar::InspectParams<float> {
   TileLists lists;
+  // Instead of depths, where splats are Gaussians.
+  CameraView<float> camera;
+  const Vec3<float>* means;
 };
 
 /// From gradients of images to sums of pairs. Without channels.data dL_dimage.first is not null.

@@ -84,6 +84,7 @@ struct FootprintArguments {
 struct RasterizeArguments : Inputs, FootprintArguments {
   Tensor bg;  ///< (C,).
   ImageSwitches images = {};
+  SummarySwitches summary = {};
   bool keep = false, debug = false;
   std::string means2d_z = "zero";  ///< Column 2 of the gradient of means2D: "zero", "sum_abs", "sum_norm".
   OptionalTensor features;         ///< (P, K), blended on zero after three colours.
@@ -93,6 +94,7 @@ struct RasterizeArguments : Inputs, FootprintArguments {
     visit("bg", bg);
     FootprintArguments::each(visit);
     for (size_t k = 0; k < kImageCount; ++k) visit(kImageSwitches[k], images[k]);
+    for (size_t k = 0; k < kSummaryCount; ++k) visit(kSummarySwitches[k], summary[k]);
     visit("keep=False", keep);
     visit("debug=False", debug);
     visit("means2d_z=\"zero\"", means2d_z);
@@ -275,14 +277,16 @@ struct CompositeArguments : ImageArguments {
 };
 
 struct InspectArguments : ImageArguments {
-  std::vector<Tensor> saved;  ///< Of `rasterize`.
-  Tensor depths;              ///< (P,), for P, which torch.compile would fix if it was a number.
+  std::vector<Tensor> lists;  ///< Of `bin`, of one camera.
+  Tensor depths;              ///< (N,) of the rows.
+  SummarySwitches summary = {};
   int64_t count() const { return depths.size(0); }
 
   template <class Visit> void each(Visit&& visit) {
-    visit("saved", saved);
+    visit("lists", lists);
     visit("depths", depths);
     ImageArguments::each(visit);
+    for (size_t k = 0; k < kSummaryCount; ++k) visit(kSummarySwitches[k], summary[k]);
   }
 };
 

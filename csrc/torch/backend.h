@@ -82,12 +82,13 @@ struct KeptRows {
   }
 };
 
-/// What `inspect` writes, in the order of the op's result.
+/// What `inspect` writes, in the order of the ops' results. Undefined: not wanted.
 struct SummaryTensors {
-  Tensor median, dominant;              ///< (H, W) int32.
+  Tensor median;                        ///< (1, H, W) depth.
+  Tensor dominant;                      ///< (1, H, W) int32.
   Tensor touched, in_front, dominated;  ///< (count,) int32.
   Tensor largest;                       ///< (count,) float32. Kernels compare its bits as int32.
-  Tensor total;                         ///< (count,) int64.
+  Tensor total;                         ///< (count,) int64 in units of kWeightUnit.
 
   template <class Visit> void each(Visit&& visit) {
     visit("median", median);
@@ -227,8 +228,10 @@ class Backend {
   /// Writes `image` and what make_state() made, and makes the other members of `state`.
   virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                      const ImageTensors& image, BlendState& state) = 0;
-  /// Writes median and dominant. The other members are zero before.
-  virtual void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) = 0;
+  /// Writes median and dominant. The other members are zero before. `depths` are those of splats: the result of
+  /// `project`, on CUDA undefined, and then of the Gaussians `in`; or of rows, without `in`.
+  virtual void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs* in,
+                       const SummaryTensors& summary) = 0;
 
   // Backward.
   /// Zeros where project_vjp, which must follow, writes nothing. May run beside blend_vjp.

@@ -181,9 +181,10 @@ template <typename T> class CpuBackend final : public Backend {
     stages_of(pass.footprint).blend(p);
   }
 
-  void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) override {
+  void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs*,
+               const SummaryTensors& summary) override {
     cpu::InspectParams<T> p = {};
-    set_inspect<T>(p, lists, pass, summary);
+    set_inspect<T>(p, lists, pass, depths, summary);
     p.ids = const_pointer<int32_t>(lists.ids);
     p.lists = tile_lists_of(lists);
     p.threads = thread_count();

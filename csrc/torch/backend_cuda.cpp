@@ -175,13 +175,18 @@ class CudaBackend final : public Backend {
     check_stage("blend", pass.debug);
   }
 
-  void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) override {
+  void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs* in,
+               const SummaryTensors& summary) override {
     check_counts(lists);
     cuda::InspectParams p = {};
-    set_inspect<float>(p, lists, pass, summary);
+    set_inspect<float>(p, lists, pass, depths, summary);
     p.lists = tile_lists_of(lists);
+    if (in) {
+      p.camera = camera_of<float>(*in);
+      p.means = const_pointer<Vec3<float>>(in->means3D);
+    }
     cuda::inspect(pass.footprint.choice.index, p, stream_);
-    check_stage("inspect", false);
+    check_stage("inspect", pass.debug);
   }
 
   void zero_culled_grads(const Inputs& in, const ListTensors& lists, const Pass& pass, const Grads& grads) override {

@@ -74,6 +74,14 @@ void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& 
   TORCH_CHECK_VALUE(rises_to(row_splits, n), "row_splits must rise from 0 to the number of rows, ", n);
 }
 
+/// Pixels of a Gaussian are counted in int32.
+void check_countable(const SummarySwitches& wanted, int64_t height, int64_t width) {
+  constexpr int64_t kMostPixels = int64_t(1) << 31;
+  TORCH_CHECK_VALUE(!any_of(wanted) || height * width < kMostPixels,
+                    "gaussian_stats and dominant Gaussians need an image of fewer than ", kMostPixels, " pixels, got ",
+                    height, " x ", width);
+}
+
 /// Without debug such Gaussians are culled, or rendered.
 void check_gaussians(Inputs in) {
   size_t k = 0;
@@ -206,6 +214,7 @@ void check(RasterizeArguments& a) {
   }
   TORCH_CHECK_VALUE(a.means2d_z == "zero" || a.means2d_z == "sum_abs" || a.means2d_z == "sum_norm",
                     "means2d_z must be zero, sum_abs or sum_norm, got ", a.means2d_z);
+  check_countable(a.summary, a.image_height, a.image_width);
 }
 
 void check_values(const RasterizeArguments& a) {
@@ -372,18 +381,17 @@ void check(CompositeArguments& a) {
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);
-  constexpr int64_t kMostPixels = int64_t(1) << 31;  // `touched` is int32.
-  TORCH_CHECK_VALUE(a.image_height * a.image_width < kMostPixels,
-                    "gaussian_stats and dominant Gaussians need an image of fewer than ", kMostPixels, " pixels, got ",
-                    a.image_height, " x ", a.image_width);
+  check_countable(a.summary, a.image_height, a.image_width);
   check_lists(lists, lists.splats, pass);
   // The results are indexed by ids on the CPU and by splats on CUDA.
   const int64_t n = lists.splats.size(0);
   const bool by_id = !lists.splats.is_cuda() && n > 0;
   TORCH_CHECK_VALUE(!by_id || lists.ids.min().item<int64_t>() >= 0, "ids must not be negative");
   const int64_t needed = by_id ? lists.ids.max().item<int64_t>() + 1 : n;
-  const bool fits = a.depths.dim() == 1 && a.count() >= needed && a.count() < (int64_t(1) << 31);
-  check_shape(fits, a.depths, "depths", "(P,) with P the number of Gaussians, at least ", needed);
+  Like{lists.splats, "lists"}.check_type(a.depths, "depths");
+  const bool fits = a.depths.dim() == 1 && a.depths.size(0) >= needed && a.depths.size(0) < (int64_t(1) << 31);
+  check_shape(fits, a.depths, "depths", "(N,) with N the number of rows, at least ", needed);
+  a.depths = a.depths.contiguous();
 }
 
 void check(WeightArguments& a) {

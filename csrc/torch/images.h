@@ -16,6 +16,15 @@ inline constexpr std::array<const char*, kImageCount> kImageSwitches = {"alpha=F
                                                                         "inverse_depth=False"};
 using ImageSwitches = std::array<bool, kImageCount>;
 
+/// What a picture shows, without gradient, in the order of the ops' results.
+enum SummaryIndex : size_t { kMedianDepth, kDominantIndex, kGaussianStats, kSummaryCount };
+inline constexpr std::array<const char*, kSummaryCount> kSummarySwitches = {
+    "median_depth=False", "dominant_index=False", "gaussian_stats=False"};
+using SummarySwitches = std::array<bool, kSummaryCount>;
+inline bool any_of(const SummarySwitches& wanted) {
+  return wanted[kMedianDepth] || wanted[kDominantIndex] || wanted[kGaussianStats];
+}
+
 /// Images, or their gradients. Undefined: not wanted, or zero.
 struct ImageTensors {
   Tensor color;                            ///< (C, H, W), with features.

@@ -54,8 +54,8 @@ template <class A, Results (*kRun)(A)> struct Op {
 
 /// visit(op, name, results) for every op.
 template <class Visit> void each_op(const Visit& visit) {
-  const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved",
-             *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved, Tensor seconds",
+  const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] summary, Tensor[] saved",
+             *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] summary, Tensor[] saved, Tensor seconds",
              *projected =
                  "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor features, Tensor radii, "
                  "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor dets, Tensor conics, "
@@ -144,9 +144,9 @@ template <class Members> std::vector<std::string> member_names() {
   return names;
 }
 
-std::vector<std::string> image_names() {
+template <size_t kCount> std::vector<std::string> names_of(const std::array<const char*, kCount>& switches) {
   std::vector<std::string> names;
-  for (const char* declaration : kImageSwitches) names.emplace_back(name_of(declaration));
+  for (const char* declaration : switches) names.emplace_back(name_of(declaration));
   return names;
 }
 
@@ -257,7 +257,8 @@ PYBIND11_MODULE(_C, m) {
   m.def("gradient_was_required", &ar::ops::gradient_was_required,
         "Whether an op of this process has been called for which autograd will ask a gradient.");
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
-  m.attr("IMAGES") = ar::ops::image_names();
+  m.attr("IMAGES") = ar::ops::names_of(ar::ops::kImageSwitches);
+  m.attr("SUMMARIES") = ar::ops::names_of(ar::ops::kSummarySwitches);
   m.attr("LENS") = ar::ops::lens_members();
   m.def("lens_points", &ar::ops::lens_points,
         "Positions and derivatives of points through a lens (csrc/torch/cameras.cpp).");

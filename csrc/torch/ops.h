@@ -14,7 +14,8 @@ namespace ar::ops {
 /// `saved` is for the adjoint, which returns a gradient per tensor argument, empty if not wanted.
 using Results = std::vector<IValue>;
 
-/// color (C + K, H, W): colours and features; images (H, W), if wanted; radii (P,) int32; saved.
+/// color (C + K, H, W): colours and features; images (H, W), if wanted; radii (P,) int32; summary: what is
+/// wanted of SummaryTensors, `total` as sums of weights in the scene's dtype; saved, which is always the last.
 Results rasterize(RasterizeArguments a);
 /// The same; seconds (3,) float64 of project, bin and blend. Always saves the lists.
 Results rasterize_timed(RasterizeArguments a);
@@ -61,7 +62,7 @@ Results bin(BinArguments a);
 Results blend(BlendArguments a);
 Results blend_vjp(VjpArguments<BlendArguments> a);
 
-/// SummaryTensors.
+/// The same summary, of the splats of `bin`: medians of the depths that are given, and ids that are rows.
 Results inspect(InspectArguments a);
 
 Results footprint_weight(WeightArguments a);

@@ -102,7 +102,7 @@ Results picture_gradients(PictureArguments a) {
   for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
   needs[1] = a.mean_columns > 0;
   const std::vector<Tensor> of_scene =
-      gradients_of(rasterize_vjp({{dL_dimage}, scene, rendered[3].toTensorVector(), needs}));
+      gradients_of(rasterize_vjp({{dL_dimage}, scene, rendered.back().toTensorVector(), needs}));
   Tensor dL_dscales = of_scene[5], dL_dopacities = of_scene[2];
   if (a.filter_3d) {
     const std::vector<Tensor> of_filter =

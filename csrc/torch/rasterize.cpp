@@ -1,5 +1,5 @@
 // The ops `rasterize` and `rasterize_timed` (check, project, bin, blend), `rasterize_vjp` (blend_vjp, project_vjp) and
-// `inspect`, which reads what rasterize saved. They call a Backend (backend.h) stage by stage.
+// `inspect`, which looks at lists of `bin`. They call a Backend (backend.h) stage by stage.
 #include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/tensor.h>
@@ -80,6 +80,35 @@ struct Saved {
   }
 };
 
+/// Memory for what `inspect` writes of `count` Gaussians or rows.
+SummaryTensors make_summary(const Backend& backend, const SummarySwitches& wanted, TileGrid grid, int64_t count,
+                            const Tensor& like) {
+  const at::TensorOptions options = like.options(), ints = options.dtype(at::kInt);
+  const std::vector<int64_t> image = {1, grid.height, grid.width};
+  SummaryTensors out;
+  if (wanted[kMedianDepth]) out.median = at::empty(image, options);
+  if (wanted[kDominantIndex]) out.dominant = at::empty(image, ints);
+  if (wanted[kGaussianStats]) {
+    for (Tensor* t : {&out.touched, &out.in_front, &out.dominated}) *t = at::zeros({count}, ints);
+    out.largest = at::zeros({count}, options.dtype(at::kFloat));
+    out.total = at::zeros({count}, options.dtype(at::kLong));
+  }
+  out.each([&](const char* name, const Tensor& t) {
+    if (t.defined()) check_output(backend, name, like);
+  });
+  return out;
+}
+
+/// What ops return of it.
+std::vector<Tensor> results_of(SummaryTensors summary, at::ScalarType type) {
+  if (summary.total.defined()) summary.total = summary.total.to(at::kDouble).mul_(kWeightUnit).to(type);
+  std::vector<Tensor> out;
+  summary.each([&](const char*, const Tensor& t) {
+    if (t.defined()) out.push_back(t);
+  });
+  return out;
+}
+
 /// Appends four times to `seconds`, if given: before project, and of project, bin and blend.
 Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = false) {
   const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
@@ -102,6 +131,7 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
     const ListTensors lists = backend->bin(splats, pass);
     lap();
     const ImageTensors image = make_images(*backend, channels, a.images, pass.grid);
+    const SummaryTensors summary = make_summary(*backend, a.summary, pass.grid, a.count(), a.means3D);
     BlendState state = make_state(pass, a.means3D);
     backend->blend(lists, pass, channels, image, state);
     lap();
@@ -109,6 +139,7 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
       seconds->clear();
       return run(a, seconds, true);
     }
+    if (any_of(a.summary)) backend->inspect(lists, pass, splats.depths, &a, summary);
     std::vector<Tensor> images, saved;
     for (const Tensor& other : image.others) {
       if (other.defined()) images.push_back(other);
@@ -118,7 +149,7 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
       append_to(saved, state);
       saved.push_back(or_empty(channels.made_by_projection() ? channels.rows : Tensor(), a.means3D));
     }
-    return Results{image.color, images, radii, saved};
+    return Results{image.color, images, radii, results_of(summary, a.means3D.scalar_type()), saved};
   });
 }
 
@@ -182,24 +213,16 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
 }
 
 Results inspect(InspectArguments a) {
-  const ListTensors lists = Saved(a.saved).lists;
+  TORCH_CHECK_VALUE(a.lists.size() == ListTensors::kMembers,
+                    "lists must be the output of list_tiles for one camera, got ", a.lists.size(), " tensors");
+  const ListTensors lists = from_list<ListTensors>(a.lists, 0);
   const Pass pass(a, lists.splats);
   check(a, lists, pass);
   const std::unique_ptr<Backend> backend = make_backend(lists.splats);
-  const at::TensorOptions options = lists.splats.options(), ints = options.dtype(at::kInt);
-  SummaryTensors summary;
-  summary.each([&](const char* name, Tensor&) { check_output(*backend, name, lists.splats); });
-  summary.median = at::empty({a.image_height, a.image_width}, ints);
-  summary.dominant = at::empty_like(summary.median);
-  summary.touched = at::zeros({a.count()}, ints);
-  summary.largest = at::zeros({a.count()}, options.dtype(at::kFloat));
-  summary.total = at::zeros({a.count()}, options.dtype(at::kLong));
-  summary.in_front = at::zeros({a.count()}, ints);
-  summary.dominated = at::zeros({a.count()}, ints);
-  backend->inspect(lists, pass, summary);
-  std::vector<Tensor> out;
-  append_to(out, summary);
-  return {out};
+  const SummaryTensors summary = make_summary(*backend, a.summary, pass.grid, a.count(), lists.splats);
+  const Tensor depths = lists.splats.is_cuda() ? a.depths : a.depths.index_select(0, lists.ids);
+  if (any_of(a.summary)) backend->inspect(lists, pass, depths, nullptr, summary);
+  return {results_of(summary, lists.splats.scalar_type())};
 }
 
 }  // namespace ar::ops

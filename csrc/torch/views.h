@@ -208,10 +208,12 @@ void set_blend(Params& p, const ListTensors& lists, const Pass& pass, const Chan
 }
 
 template <typename T>
-void set_inspect(InspectParams<T>& p, const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) {
+void set_inspect(InspectParams<T>& p, const ListTensors& lists, const Pass& pass, const Tensor& depths,
+                 const SummaryTensors& summary) {
   p.splats = const_pointer<T>(lists.splats);
   p.grid = pass.grid;
-  p.median = pointer<int32_t>(summary.median);
+  p.depths = const_pointer<T>(depths);
+  p.median = pointer<T>(summary.median);
   p.dominant = pointer<int32_t>(summary.dominant);
   p.touched = pointer<int32_t>(summary.touched);
   p.largest = reinterpret_cast<int32_t*>(pointer<float>(summary.largest));

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <random>
+#include <set>
 #include <vector>
 
 namespace ar::cuda {
@@ -54,7 +55,24 @@ TEST(PairGuessTest, CountsTheFirstFramesAndThenLeavesAReserve) {
   EXPECT_EQ(renderer.count_frames(1000, 1000000), kCountedFrames);
   const int64_t room = renderer.frame(1000, 1000000);
   EXPECT_GE(room, 1250000);
-  EXPECT_LE(room, 1250000 + (1 << 16));
+  EXPECT_LE(room, (1250000 + (1 << 16)) * 9 / 8);
+}
+
+TEST(PairGuessTest, RoomHasEightSizesInAnOctave) {
+  std::set<int64_t> sizes;
+  for (int64_t number = 1 << 20; number < 1 << 21; number += 997) {
+    const int64_t stepped = in_steps(number);
+    EXPECT_GE(stepped, number);
+    EXPECT_LE(stepped, number + number / 8);
+    sizes.insert(stepped);
+  }
+  EXPECT_EQ(sizes.size(), 9u) << "both ends of the octave";
+  for (int64_t number = 0; number <= 16; ++number) EXPECT_EQ(in_steps(number), number);
+  Renderer renderer;
+  renderer.count_frames(1000, 1000000);
+  sizes.clear();
+  for (int64_t pairs = 1000000; pairs < 2000000; pairs += 10000) sizes.insert(renderer.frame(1000, pairs));
+  EXPECT_LE(sizes.size(), 10u);
 }
 
 TEST(PairGuessTest, RemembersTheLargestFrame) {
@@ -97,7 +115,7 @@ TEST(PairGuessTest, GrowsInProportionOnlyUntilTheDeviceHasSpoken) {
   int64_t room = 0;
   for (int64_t n = 1000; n < 64000; n += n / 20) room = renderer.frame(n, 1000000 + n);  // splats shrink as they divide
   EXPECT_GE(room, 1250000);
-  EXPECT_LE(room, 1700000) << "not 64 times as many";
+  EXPECT_LE(room, 1700000 * 9 / 8) << "in steps, but not 64 times as many";
 }
 
 TEST(PairGuessTest, WaitsOnlyWhereItMay) {
@@ -157,7 +175,7 @@ TEST(PairGuessTest, GrowsInProportionToTheTilesUntilTheDeviceHasSpoken) {
   while (renderer.frame(small, 1000, 1200000) == 0) {}
   EXPECT_GE(renderer.frame(large, 1000, 1300000), 2500000);
   for (int k = 0; k < 3; ++k) renderer.frame(large, 1000, 1300000);
-  EXPECT_LE(renderer.frame(large, 1000, 1300000), 1700000);
+  EXPECT_LE(renderer.frame(large, 1000, 1300000), 1700000 * 9 / 8);
 }
 
 TEST(PairGuessTest, CountsAnewForImagesOfAnotherClassOfSizes) {

@@ -3,6 +3,9 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <numeric>
+
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "random_splats.h"
@@ -13,14 +16,15 @@ namespace {
 constexpr int kWidth = 27, kHeight = 21, kSplats = 60, kUnwritten = -777;
 
 struct Looks {
-  std::vector<int32_t> median = std::vector<int32_t>(kWidth * kHeight, kUnwritten), dominant = median;
+  std::vector<float> median = std::vector<float>(kWidth * kHeight, kUnwritten);
+  std::vector<int32_t> dominant = std::vector<int32_t>(kWidth * kHeight, kUnwritten);
   std::vector<int32_t> touched = std::vector<int32_t>(kSplats), largest = touched, in_front = touched;
   std::vector<int32_t> dominated = touched;
   std::vector<int64_t> units = std::vector<int64_t>(kSplats);
 };
 
-/// Of random splats, all of which are in the list of every tile of 2^kBits pixels a side.
-template <int kBits> Looks inspect_tiles() {
+/// Of random splats, all of which are in the list of every tile of 2^kBits pixels a side. Splat k has the depth k + 1.
+template <int kBits, Look kLook = Look::kStatistics> Looks inspect_tiles() {
   constexpr int kSide = 1 << kBits;
   using F = Moment<1>;
   constexpr TileGrid grid = {kWidth, kHeight, kBits};
@@ -39,6 +43,9 @@ template <int kBits> Looks inspect_tiles() {
   params.splats = &splats[0].mean.x;
   params.grid = grid;
   params.lists = lists_of(pairs, offsets, counts);
+  std::vector<float> depths(kSplats);
+  std::iota(depths.begin(), depths.end(), 1.0f);
+  params.depths = depths.data();
   params.median = looks.median.data();
   params.dominant = looks.dominant.data();
   params.touched = looks.touched.data();
@@ -46,7 +53,7 @@ template <int kBits> Looks inspect_tiles() {
   params.in_front = looks.in_front.data();
   params.dominated = looks.dominated.data();
   params.units = looks.units.data();
-  cuda_on_host::launch(int(grid.tiles()), kInspectThreads<kSide>, [&] { inspect_kernel<F, kSide>(params); });
+  cuda_on_host::launch(int(grid.tiles()), kInspectThreads<kSide>, [&] { inspect_kernel<F, kSide, kLook>(params); });
   return looks;
 }
 
@@ -66,6 +73,31 @@ void expect_the_same(const Looks& small, const Looks& large) {
         << k;
   }
 }
+TEST(InspectKernel, FindsTheSameWithoutStatistics) {
+  const Looks all = inspect_tiles<kTileBits>(), images = inspect_tiles<kTileBits, Look::kImages>();
+  EXPECT_EQ(images.median, all.median);
+  EXPECT_EQ(images.dominant, all.dominant);
+  EXPECT_GT(*std::max_element(all.median.begin(), all.median.end()), 1);
+  for (const int32_t touched : images.touched) EXPECT_EQ(touched, 0);
+  const Looks medians = inspect_tiles<kTileBits, Look::kMedian>();
+  EXPECT_EQ(medians.median, all.median);
+  for (const int32_t dominant : medians.dominant) EXPECT_EQ(dominant, kUnwritten);
+}
+
+/// Of a camera that looks along z from -1, and of one with a lens that orders by distance.
+TEST(InspectKernel, FindsDepthsOfMeans) {
+  const float view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1}, zeros[16] = {};
+  const Vec3<float> mean = {3, 4, 11};
+  InspectParams params = {};
+  params.means = &mean;
+  params.camera = {view, zeros, zeros, kWidth, kHeight, 1, 1};
+  EXPECT_EQ(depth_of_splat(params, 0), 12);
+  Lens<float> lens = {};
+  lens.model = float(kCameraModel<Fisheye>);
+  params.camera.lens = reinterpret_cast<const float*>(&lens);
+  EXPECT_EQ(depth_of_splat(params, 0), 13);
+}
+
 TEST(InspectKernel, LooksAtEveryPixel) {
   const Looks usual = inspect_tiles<kMovingTileBits>();
   expect_the_same(usual, inspect_tiles<kTileBits>());
