@@ -112,6 +112,23 @@ def measure(
     return measured
 
 
+def start_peaks(device: str) -> None:
+    """Peaks of memory start again, from an emptied cache."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+
+
+def peaks_of_memory(device: str) -> dict[str, float | None]:
+    """MiB that torch's allocator has had in use and reserved, at most; None on the CPU."""
+    if device == "cpu":
+        return {"used_mib": None, "reserved_mib": None}
+    torch.cuda.synchronize()
+    peaks = {"used_mib": torch.cuda.max_memory_allocated(), "reserved_mib": torch.cuda.max_memory_reserved()}
+    return {name: peak / 2**20 for name, peak in peaks.items()}
+
+
 def mean_of(samples: list[dict]) -> dict:
     """The mean of every key."""
     return {key: statistics.mean(sample[key] for sample in samples) for key in samples[0]}

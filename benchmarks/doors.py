@@ -25,7 +25,17 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from common import CLOCKS, add_measuring, mean_of, measure, parse, print_setup, save_json
+from common import (
+    CLOCKS,
+    add_measuring,
+    mean_of,
+    measure,
+    parse,
+    peaks_of_memory,
+    print_setup,
+    save_json,
+    start_peaks,
+)
 from effects import EffectCase, effect, lens
 from peers import find_peers
 from scene_files import load_scene
@@ -150,17 +160,13 @@ def count_events(cases: list[Case]) -> dict[str, float]:
     return result
 
 
-def peak_memory(cases: list[Case]) -> dict[str, float]:
-    """Bytes that torch's allocator has in use and reserves, at most."""
-    torch.cuda.synchronize()
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
+def peak_memory(cases: list[Case]) -> dict[str, float | None]:
+    start_peaks("cuda")
     for _ in range(MEMORY_PASSES):
         for case in cases:
             case.forward()
             case.forward_backward()
-    torch.cuda.synchronize()
-    return {"used": torch.cuda.max_memory_allocated(), "reserved": torch.cuda.max_memory_reserved()}
+    return peaks_of_memory("cuda")
 
 
 def format_results(results: dict[str, dict], doors: dict[str, Door], device: str) -> str:
@@ -174,7 +180,7 @@ def format_results(results: dict[str, dict], doors: dict[str, Door], device: str
             row += [1e3 * result[key], result[key] / base[key], result[key] / peer[key] if peer else None]
         if on_cuda:
             row += [1e3 * result[f"host_{key}"] for key in PASSES] + [result[f"events_{key}"] for key in PASSES]
-            row += [result[key] / 2**20 for key in ("used", "reserved")]
+            row += [result["used_mib"], result["reserved_mib"]]
         rows.append(row)
     return markdown_table(header, rows)
 

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from common import has_cuda
+from common import has_cuda, peaks_of_memory, start_peaks
 
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
@@ -163,21 +163,19 @@ class Training:
     def run(self, test) -> dict[str, float | int | None]:
         """A row of the table, by what it says."""
         torch.manual_seed(self.options.seed)
-        if self.on_cuda:
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats()
+        start_peaks(self.args.device)
         order, clock = PictureOrder(len(self.pictures.views), self.options), Clock(self.device)
         clock.start()
         for step in range(self.options.iterations):
             self.step(step, order(step)[0])
         clock.stop()
-        used, reserved = None, None
-        if self.on_cuda:
-            used, reserved = (
-                peak / 2**20 for peak in (torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved())
-            )
-        row = {"seconds": clock.read(), "psnr": self.psnr(test), "gaussians": len(self.params["means"])}
-        return row | {"used_mib": used, "reserved_mib": reserved}
+        memory = peaks_of_memory(self.args.device)
+        return {
+            "seconds": clock.read(),
+            "psnr": self.psnr(test),
+            "gaussians": len(self.params["means"]),
+            **memory,
+        }
 
     @torch.no_grad()
     def psnr(self, test) -> float | None:

@@ -10,7 +10,9 @@ All variants of a seed see the same pictures in the same order, unless they chan
 
 A row of the table is a variant: PSNR [dB] of the test pictures per scale and their mean, ± the standard deviation over
 seeds of that mean; SSIM; Gaussians in the end; seconds of training alone, without reading pictures and testing, and the
-median time of a step, from looks at the clock every 100 steps. The JSON file holds every run with its options and its
+median time of a step, from looks at the clock every 100 steps; peaks of what torch's allocator had in use and reserved
+on CUDA, pictures and test included: compare with PYTORCH_ALLOC_CONF=expandable_segments:True, which `train` sets. The
+JSON file holds every run with its options and its
 history, and is rewritten after each of them. Variants follow each other within a seed, so that a machine that slows
 down slows all of them.
 """
@@ -26,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import has_cuda
+from common import has_cuda, peaks_of_memory, start_peaks
 from tqdm import tqdm
 
 from analytic_rasterizer.analysis.tables import format_table
@@ -136,6 +138,7 @@ def train_once(options: TrainingOptions, seed: int, capture, train, test, args) 
     """One training and its test."""
     options = TrainingOptions.from_dict(options.to_dict() | {"seed": seed})
     background = background_of(options, capture.background)
+    start_peaks(args.device)
     trainer = Trainer(options, starting_gaussians(options, capture.points), train, background, args.device)
     trainer.warm_up()
     clock, history = Clock(trainer.device), []
@@ -159,6 +162,7 @@ def train_once(options: TrainingOptions, seed: int, capture, train, test, args) 
         "seconds": clock.read(),
         "ms_per_step": 1e3 * statistics.median(paces),
         "gaussians": len(trainer.gaussians.means),
+        **peaks_of_memory(args.device),
         "test": results,
         "history": history,
     }
@@ -179,9 +183,11 @@ def format_runs(runs: list[dict], scales: tuple[int, ...]) -> str:
                 round(statistics.mean(run["gaussians"] for run in of_variant)),
                 f"{statistics.mean(run['seconds'] for run in of_variant):.1f}",
                 f"{statistics.mean(run['ms_per_step'] for run in of_variant):.2f}",
+                *(max(run[key] or 0 for run in of_variant) or None for key in ("used_mib", "reserved_mib")),
             ]
         )
     header = ["variant", *(f"1/{scale}" for scale in scales), "mean", "SSIM", "Gaussians", "seconds", "ms/step"]
+    header += ["used MiB", "reserved MiB"]
     return format_table(header, rows)
 
 

@@ -4,9 +4,11 @@
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer [--tool racecheck] python tests/every_kernel.py [PART ...]
 
 The parts are the footprints, and the others at the end of this file. Each footprint is rendered forward and backward
-in images of several kinds, which have different kernels. With all parts the program fails if the library has a kernel
-that was not launched; the names of kernels are in the file of the library. Without torch's cache of memory every tensor
-is its own allocation, so that memcheck notices accesses beyond it. Nothing is compared here: the other tests do that.
+in images of several kinds, which have different kernels. With all parts the program fails if the library has an
+operator that was not called, or a kernel that was not launched; the names of kernels are in the file of the library.
+For a new operator, write a part that calls it, with all that chooses between its kernels. Without torch's cache of
+memory every tensor is its own allocation, so that memcheck notices accesses beyond it. Nothing is compared here: the
+other tests do that.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ from typing import NamedTuple
 
 import scenes
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
 from analytic_rasterizer.activations import activate
+from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.optim import FusedAdam
 
@@ -96,13 +100,14 @@ FEW_IMAGES = ("large, few tiles", "small", "small, opaque")
 
 
 def footprint(device: str, images: Sequence[str] = FEW_IMAGES, **settings) -> None:
-    """Every number of channels that has its own kernels, with and without sums of absolute gradients, and `inspect`."""
+    """Every number of channels that has its own kernels, with and without sums of absolute gradients, and all looks."""
     render(device, images=IMAGES if images is FEW_IMAGES else images, **settings)
     for channels in (1, 40):
         render(device, channels=channels, images=images, **settings)
     for channels in (3, 1, 70):  # 32, 32 and 8: with these sums later groups have their own kernels
         render(device, channels=channels, images=images[-2:], absolute=True, **settings)
-    render(device, images=images, effects=ar.Effects(gaussian_stats=True), **settings)
+    for name in _C.SUMMARIES:
+        render(device, images=images, effects=ar.Effects(**{name: True}), **settings)
 
 
 def many_channels(device: str) -> None:
@@ -141,6 +146,7 @@ def stages(device: str) -> None:
         settings = image.camera().settings(torch.float32, device, footprint=footprint, effects=effects)
         leaves = scenes.leaves(image.scene(device))
         del leaves["means2D"]
+        ar.render_stages(settings._replace(sh_degree=3), **leaves)
         splats = ar.project([settings._replace(sh_degree=3)] * 2, **leaves)
         for features in (
             None,
@@ -148,6 +154,35 @@ def stages(device: str) -> None:
             torch.rand(len(splats.depths), 6, device=device),
         ):
             ar.blend(splats, ar.list_tiles(splats), features)[0].sum().backward(retain_graph=True)
+        one, looks = splats.split()[0], dict.fromkeys(_C.SUMMARIES, True)
+        lists = list(ar.list_tiles(one, keep=False).tensors)
+        torch.ops.analytic_rasterizer.inspect(lists, one.depths.detach(), **one.size, **looks)
+
+
+def gsplat(device: str) -> None:
+    """Rows of both layouts to images, of few channels and of many."""
+    means, quats, scales = (torch.rand(300, n, device=device).requires_grad_() for n in (3, 4, 3))
+    opacities, harmonics = torch.rand(300, device=device), torch.rand(300, 4, 3, device=device).requires_grad_()
+    poses = torch.eye(4, device=device).repeat(2, 1, 1)
+    poses[:, 2, 3] = 3
+    intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]], device=device).repeat(2, 1, 1)
+    for colors, options in (
+        (harmonics, {"sh_degree": 1, "render_mode": "RGB+ED"}),
+        (harmonics, {"sh_degree": 1, "absgrad": True}),
+        (torch.rand(300, 40, device=device), {"camera_model": "fisheye"}),
+    ):
+        for packed in (True, False):
+            given = (means, quats, 0.1 * scales, opacities, colors, poses, intrinsics, 48, 40)
+            rasterization(*given, packed=packed, **options)[0].sum().backward()
+
+
+def rows(device: str) -> None:
+    """Packed rows, which ranks send to each other, of plain cameras and others."""
+    from test_distributed import CAMERAS, UNSEEING, calls_of
+
+    for camera in range(len(CAMERAS)):
+        for name, arguments in calls_of(device, camera).items() if camera != UNSEEING else ():
+            getattr(torch.ops.analytic_rasterizer, name)(**arguments)
 
 
 def too_many_pairs(device: str) -> None:
@@ -202,6 +237,13 @@ def steps(device: str) -> None:
         leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
         sum(made.sum() for made in activate(*leaves)).backward()
         FusedAdam(leaves).step()
+        ops, count = torch.ops.analytic_rasterizer, len(leaves[0])
+        filtered = ops.apply_3d_filter(leaves[0], leaves[2], torch.rand(count, **numbers))
+        sum(made.sum() for made in filtered).backward()
+        log_scales, quats, logits = (leaf.detach() for leaf in leaves)
+        ops.add_noise_(
+            torch.zeros(count, 3, **numbers), log_scales, quats, logits, torch.rand(count, 3, **numbers), 0.1
+        )
         matrix = torch.eye(3, 4, **numbers).requires_grad_()
         torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
         sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
@@ -224,13 +266,32 @@ def training(device: str) -> None:
 PARTS = {scenes.name_of(variant): partial(footprint, footprint=variant[0], **variant[1]) for variant in scenes.VARIANTS}
 PARTS |= {"largest": partial(footprint, images=("large", "largest"), footprint="box:samples=4")}
 PARTS |= {"channels": many_channels, "pairs": too_many_pairs, "sorts": sorts, "stages": stages, "weights": weights}
-PARTS |= {"cameras": cameras, "effects": effects, "losses": losses, "steps": steps, "training": training}
+PARTS |= {"cameras": cameras, "effects": effects, "gsplat": gsplat, "losses": losses, "rows": rows}
+PARTS |= {"steps": steps, "training": training}
 
 
 def kernels_of_library() -> set[str]:
     """Mangled names of the kernels in the library, which registers them with CUDA by these names."""
     names = re.findall(rb"(?<=\0)_ZN2ar4cuda[A-Za-z0-9_]*kernel[A-Za-z0-9_]*(?=\0)", Path(_C.__file__).read_bytes())
     return {name.decode() for name in names}
+
+
+class OpsCalled(TorchDispatchMode):
+    """Names of the operators of this package that are called."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.namespace == "analytic_rasterizer":
+            self.names.add(func._schema.name.split("::")[1])
+        return func(*args, **(kwargs or {}))
+
+
+def registered_ops() -> set[str]:
+    names = (name.split(".")[0].split("::") for name in torch._C._dispatch_get_all_op_names())
+    return {name for namespace, name in names if namespace == "analytic_rasterizer"}
 
 
 def main() -> None:
@@ -241,17 +302,22 @@ def main() -> None:
     on_cuda = args.device == "cuda"
     if on_cuda:
         _C.record_kernels(True)
+    called = OpsCalled()
     for name in args.parts:
-        PARTS[name](args.device)
+        with called:
+            PARTS[name](args.device)
         if on_cuda:
             torch.cuda.synchronize()
         print(name, flush=True)
+    everything = set(args.parts) == set(PARTS)
+    if everything and registered_ops() - called.names:
+        sys.exit("\n".join(["not called:", *sorted(registered_ops() - called.names)]))
     if not on_cuda:
         return
     known, launched = kernels_of_library(), set(_C.launched_kernels())
     _C.record_kernels(False)
     print(f"{len(launched & known)} of {len(known)} kernels were launched")
-    if launched - known or (known - launched and set(args.parts) == set(PARTS)):
+    if launched - known or (known - launched and everything):
         sys.exit("\n".join(["not launched:", *sorted(known - launched), "unknown:", *sorted(launched - known)]))
 
 

@@ -94,7 +94,7 @@ def test_fake_tensors():
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         arguments = arguments_of_op("cpu")
         fake = {name: mode.from_tensor(v.detach()) if torch.is_tensor(v) else v for name, v in arguments.items()}
-        color, _, radii, _ = _C.Call("rasterize")(**fake)
+        color, _, radii, _, _ = _C.Call("rasterize")(**fake)
     assert type(color).__name__ == "FakeTensor"
     assert color.shape == (3, CAMERA.image_height, CAMERA.image_width)
     assert radii.shape == (20,)

@@ -22,8 +22,13 @@ inline void atomic_max(int32_t* bits, float value) {
 template <class P, Look kLook, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile) {
   const TileView view(p.grid, tile);
   PixelSummary<T, P, kLook> pixels[kTilePixels];
-  for (int i = 0; i < kTilePixels; ++i) pixels[i].start(i % kTile < view.columns && i / kTile < view.rows);
-  for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1]; ++k) {
+  bool open[kTilePixels];
+  for (int i = 0; i < kTilePixels; ++i) {
+    open[i] = i % kTile < view.columns && i / kTile < view.rows;
+    pixels[i].start(open[i]);
+  }
+  int left = view.columns * view.rows;  // open pixels
+  for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1] && left > 0; ++k) {
     const int32_t j = p.lists.pairs[k], id = p.ids[j];
     const Splat<P, T>& splat = splat_at<P>(p.splats, j);
     const Support<T> support = support_of(splat);
@@ -35,9 +40,11 @@ template <class P, Look kLook, typename T> AR_ONE_COPY void inspect_tile(const c
       const Span<T> span = columns_of(support, T(view.y0 + row), T(view.y0 + row));
       for (int column = 0; column < view.columns; ++column) {
         if (!(span.lo <= T(view.x0 + column) && span.hi >= T(view.x0 + column))) continue;
-        auto& pixel = pixels[row * kTile + column];
-        if (!pixel.open()) continue;
-        const Shown<T> shown = pixel.add(terms, {T(column), T(row)}, j);
+        const int i = row * kTile + column;
+        if (!open[i]) continue;
+        const Shown<T> shown = pixels[i].add(terms, {T(column), T(row)}, j);
+        open[i] = pixels[i].open();
+        left -= !open[i];
         touched += shown.weight > T(0);
         in_front += shown.in_front;
         units += weight_units(shown.weight);
