@@ -250,7 +250,8 @@ class CallCase(Case):
         images = self.image(**self.inputs)
         c, h, w, channels = images.shape
         weights = fixed_weights(w, channels, images.device, c * h).view(images.shape)
-        return [images, *torch.autograd.grad(images, list(self.inputs.values()), weights)]
+        gradients = torch.autograd.grad(images, list(self.inputs.values()), weights, allow_unused=True)
+        return [images, *(g for g in gradients if g is not None)]  # with_ut has none of some of gsplat's own
 
 
 def as_large(changed: Callable[[EffectCase], EffectCase]) -> Callable[[EffectCase], EffectCase]:

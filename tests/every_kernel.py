@@ -219,7 +219,8 @@ def cameras(device: str) -> None:
         sum(t[..., :26].sum() for t in made).backward()
         numbers = made[3][0].tolist()
         leaves = [t[0].detach().requires_grad_() for t in made[:2]]
-        ops.prepare_lens(*leaves, *[None] * 8, numbers, 50, True).sum().backward()
+        for lens in (None, coefficients[0].detach().requires_grad_()):
+            ops.prepare_lens(*leaves, *[None] * 7, lens, numbers, 50, True).sum().backward()
 
 
 def losses(device: str) -> None:
@@ -236,6 +237,7 @@ def steps(device: str) -> None:
         numbers = {"dtype": dtype, "device": device}
         leaves = [torch.rand(300, width, **numbers).requires_grad_() for width in (3, 4, 1)]
         sum(made.sum() for made in activate(*leaves)).backward()
+        sum(made.sum() for made in torch.ops.analytic_rasterizer.activate(*leaves, 0.1, 0.2)).backward()
         FusedAdam(leaves).step()
         ops, count = torch.ops.analytic_rasterizer, len(leaves[0])
         filtered = ops.apply_3d_filter(leaves[0], leaves[2], torch.rand(count, **numbers))

@@ -1008,7 +1008,7 @@ def test_opcheck(op, device, name):
         for name in {"viewmatrix", "projmatrix", "campos"} & set(names):
             arguments[names.index(name)].requires_grad_(False)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    repeats = op != "rasterize_timed" and not (device == "cuda" and op in ("rasterize", "bin", "blend"))
+    repeats = op != "rasterize_timed" and not (device == "cuda" and op in ("rasterize", "bin", "blend", "composite"))
     if repeats and name in DISPATCHED:
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(function, arguments, test_utils=checks)

@@ -97,6 +97,7 @@ std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> ne
     out.push_back(!needs[k] || !tensor   ? at::empty({0}, a.means3D.options())
                   : cameras == 0         ? at::zeros_like(*tensor)
                   : k < kGaussianTensors ? of_gaussians[k]
+                  : cameras == 1         ? of_cameras[k - kGaussianTensors][0].unsqueeze(0)
                                          : at::stack(of_cameras[k - kGaussianTensors]));
   });
   out.erase(out.begin() + 1);  // means2D

@@ -25,6 +25,9 @@ Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
 
 Tensor join(const std::vector<Tensor>& parts) { return parts.size() == 1 ? parts[0] : at::cat(parts); }
 
+/// Of one alone no copy is made.
+Tensor stack(const std::vector<Tensor>& parts) { return parts.size() == 1 ? parts[0].unsqueeze(0) : at::stack(parts); }
+
 struct CameraPart {
   ListTensors lists;
   RowTensors rows;
@@ -77,8 +80,8 @@ Results blend(BlendArguments a) {
     if (a.keep) append_to(saved, state);
   }
   const auto options = a.means2d.options();
-  return {cameras ? at::stack(images) : at::empty({0, a.features.size(1), a.image_height, a.image_width}, options),
-          cameras ? at::stack(alphas) : at::empty({0, a.image_height, a.image_width}, options), saved};
+  return {cameras ? stack(images) : at::empty({0, a.features.size(1), a.image_height, a.image_width}, options),
+          cameras ? stack(alphas) : at::empty({0, a.image_height, a.image_width}, options), saved};
 }
 
 Results blend_vjp(VjpArguments<BlendArguments> arguments) {
