@@ -190,7 +190,7 @@ def _(a):
     ids = [like.new_empty(0 if a.table else rows, **ints) for _ in range(2)]
     splits = [torch.empty(cameras + 1, dtype=torch.int64, device="cpu") for _ in range(2)]
     measured = like.new_empty((*sizes, 3) if a.measured else 0)
-    shown = like.new_empty(sizes if a.measured and a.footprint == "mip" else 0)
+    shown = like.new_empty(sizes if a.measured and a.compensated else 0)
     saved = []
     if a.keep:
         saved = [radii.new_empty(radii.shape if a.table else (cameras, count)), splits[1]]

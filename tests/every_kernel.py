@@ -218,6 +218,7 @@ def cameras(device: str) -> None:
         made = ops.prepare_cameras(views, intrinsics, coefficients, 60, 50, "fisheye", 0.2, 9.0)
         sum(t[..., :26].sum() for t in made).backward()
         numbers = made[3][0].tolist()
+        numbers[-3:-1] = [0.0, 0.0]  # reach and fold, to be found
         leaves = [t[0].detach().requires_grad_() for t in made[:2]]
         for lens in (None, coefficients[0].detach().requires_grad_()):
             ops.prepare_lens(*leaves, *[None] * 7, lens, numbers, 50, True).sum().backward()

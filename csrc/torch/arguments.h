@@ -170,7 +170,10 @@ struct ProjectArguments : BatchArguments {
   bool measured = false;       ///< Rows and radii as in gsplat.
   std::string order = "model", shown = "none";  ///< Kinds of depth: of the rows, and as their last feature.
   double center = 0;
-  double near = 0, far = 0, radius_clip = 0;  ///< Of a RowMeasure.
+  // Of a RowMeasure:
+  double variance = 0;
+  bool compensated = false;
+  double near = 0, far = 0, radius_clip = 0;
   bool keep = false;
 
   bool is_table() const { return !table.empty(); }
@@ -182,6 +185,8 @@ struct ProjectArguments : BatchArguments {
     visit("order=\"model\"", order);
     visit("shown=\"none\"", shown);
     visit("center=0.0", center);
+    visit("variance=0.0", variance);
+    visit("compensated=False", compensated);
     visit("near=0.0", near);
     visit("far=0.0", far);
     visit("radius_clip=0.0", radius_clip);

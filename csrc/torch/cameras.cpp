@@ -79,8 +79,8 @@ double fold_of(const Lens<double>& lens) {
   const LimitKind kind = limit_kind(lens);
   if (kind == LimitKind::kLatitude) return kPi;
   for (int k = 0; k < kDistortion; ++k)
-    TORCH_CHECK_VALUE(std::isfinite(lens.distortion[k]), "coefficients must be finite, got ", lens.distortion[k],
-                      " at ", k);
+    TORCH_CHECK_VALUE(std::isfinite(lens.distortion[k]), "every number of coefficients must be finite, got ",
+                      lens.distortion[k], " at ", k);
   static auto* folds = new Remembered<kDistortion + 1>;
   const double fold = (*folds)(key_of_lens(lens), [&] {
     const FullCamera<double> camera = bare_camera(lens);

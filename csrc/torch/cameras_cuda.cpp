@@ -3,22 +3,11 @@
 
 #include <ATen/Dispatch.h>
 #include <ATen/ops/empty.h>
-#include <c10/cuda/CUDAException.h>
-#include <c10/cuda/CUDAGuard.h>
-#include <c10/cuda/CUDAStream.h>
 
 #include "cuda/cameras.h"
+#include "torch/cuda_stream.h"
 
 namespace ar::ops {
-namespace {
-
-template <class Launch> void on_stream(const Tensor& like, const Launch& launch) {
-  const c10::cuda::CUDAGuard guard(like.device());
-  launch(cudaStream_t(c10::cuda::getCurrentCUDAStream()));
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-}
-
-}  // namespace
 
 template <class Source> void prepare_on_cuda(const Source& source, const Tensor& like) {
   const bool searches = finds_fold(source) || finds_reach(source);

@@ -95,8 +95,9 @@ Results count_rows(BatchArguments arguments) {
     ProjectedTensors counted;
     counted.flags = ends[c];
     make_backend(in.means3D)->project_rows(in, pass, {}, counted);
+    counted.flags.cumsum_(0);
   }
-  return {cameras ? ends.cumsum_(1) : at::zeros({0, a.count()}, ints)};
+  return {cameras ? ends : at::zeros({0, a.count()}, ints)};
 }
 
 Results pack_rows(PackArguments a) {

@@ -33,10 +33,8 @@ RowRules<double> rules_of(const ProjectArguments& a, const Pass& pass) {
   rules.shown = depth_kind_of(a.shown, "shown");
   rules.measured = a.measured;
   if (!a.measured) return rules;
-  constexpr double kPixelVariance = 1.0 / 12;  // Of a square pixel, over which other footprints are integrals.
-  const bool has_variance = a.footprint == "point" || a.footprint == "mip";
-  rules.variance = has_variance ? a.option : kPixelVariance;
-  rules.compensated = a.footprint == "mip";
+  rules.variance = a.variance;
+  rules.compensated = a.compensated;
   rules.radius_clip = a.radius_clip;
   rules.near = a.near;
   rules.far = a.far;
@@ -72,7 +70,7 @@ ProjectedTensors make_rows(int64_t n, const Columns& columns, const ProjectArgum
   rows.features = at::empty({n, columns.count()}, options);
   rows.radii = a.measured ? at::empty(sizes_of(a, n, {2}), ints) : at::empty({n}, ints);
   if (a.measured) rows.conics = at::empty(sizes_of(a, n, {3}), options);
-  if (a.measured && a.footprint == "mip") rows.shown_opacities = at::empty(sizes_of(a, n, {}), options);
+  if (a.measured && a.compensated) rows.shown_opacities = at::empty(sizes_of(a, n, {}), options);
   if (!a.is_table()) rows.gaussian_ids = at::empty({n}, ints);
   if (!a.is_table()) rows.camera_ids = at::empty({n}, ints);
   rows.colored = columns.colors > 0;
@@ -109,8 +107,8 @@ Results project(ProjectArguments a) {
       counted.flags = ends[c];
       counted.colored = columns.colors > 0;
       backend->project_rows(inputs[c], pass, rules, counted);
+      counted.flags.cumsum_(0);  // By itself: a sum along rows of a matrix has a thread block a row.
     }
-    ends.cumsum_(1);
     const Tensor counts =
         p > 0 && cameras > 0 ? ends.select(1, p - 1).contiguous().cpu() : at::zeros({cameras}, at::kInt);
     for (int64_t c = 0; c < cameras; ++c) splits[c + 1] = splits[c] + counts.const_data_ptr<int32_t>()[c];

@@ -1,22 +1,13 @@
 // TrainingKernels (training.h) for CUDA tensors, float32 or float64. Launches the kernels of cuda/training.h. Never
 // waits for the device.
 #include <ATen/ops/empty.h>
-#include <c10/cuda/CUDAException.h>
-#include <c10/cuda/CUDAGuard.h>
-#include <c10/cuda/CUDAStream.h>
 
 #include "cuda/training.h"
+#include "torch/cuda_stream.h"
 #include "torch/training.h"
 
 namespace ar::ops {
 namespace {
-
-/// launch(stream) on the device of `like`. Raises the launch's error.
-template <class Launch> void on_stream(const Tensor& like, const Launch& launch) {
-  const c10::cuda::CUDAGuard guard(like.device());
-  launch(cudaStream_t(c10::cuda::getCurrentCUDAStream()));
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-}
 
 template <typename T, class Params> int64_t count_blocks(const Params& p) {
   const int64_t blocks = cuda::ssim_blocks<T>(p.planes, p.height, p.width), most = (int64_t(1) << 31) - 1;

@@ -11,12 +11,16 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from ...footprints import Footprint
+from ...footprints import COMPENSATED, DILATED, Footprint
 from ...ops import Op
 from ...rotations import rotation_matrices
 from .arguments import Mode, Signal, Sizes
 
 _AT_ONCE = 3  # channels of harmonics that `project` evaluates
+# px^2, of a square pixel. The weight of every footprint but `point` and `mip` is an integral over the pixel, whatever
+# its samples. Around the mean its covariance is that of the Gaussian plus this (tests/test_gsplat.py measures it). Its
+# peak is below 1, which the radii leave out: they are bounds.
+_PIXEL_VARIANCE = 1 / 12
 _CENTER = 0.5  # px, where gsplat has the centre of the first pixel
 _NAMES = ("means2d", "cov2d", "opacities", "depths", "features", "radii", "gaussian_ids", "camera_ids", "row_splits")
 _NAMES += ("dets", "conics", "shown_opacities")  # of the results of `project`, in order
@@ -72,6 +76,7 @@ class Scene:
     ) -> dict[str, torch.Tensor]:
         """Results of the operator, by name. A table has the sizes (..., C, N)."""
         dims, count = len(self.sizes.batch), math.prod(self.sizes.batch) * self.sizes.cameras
+        filters = self.footprint.name in (DILATED, COMPENSATED)
         flat = {name: flattened(value, value.dim() - dims) for name, value in self.gaussians.items()}
         results = _project(
             **{name: flat.get(name) for name in ("means3D", "opacities", "scales", "rotations", "cov3D_precomp")},
@@ -92,6 +97,8 @@ class Scene:
             order="z" if self.by_z else "distance",
             shown=shown,
             center=_CENTER,
+            variance=self.footprint.option if filters else _PIXEL_VARIANCE,
+            compensated=self.footprint.name == COMPENSATED,
             near=self.planes[0],
             far=self.planes[1],
             radius_clip=self.radius_clip,
