@@ -47,7 +47,7 @@ struct CameraRows {
   }
 };
 
-/// Undefined where alpha is too small for a quotient.
+/// What an accumulated depth is divided by.
 Tensor seen_alpha(const Tensor& alpha) { return alpha.clamp_min(kSmallestAlpha); }
 
 }  // namespace
