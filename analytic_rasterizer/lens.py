@@ -217,9 +217,7 @@ class Lens:
         if self.reach is not None:
             return self
         tan_x, tan_y, x, y = (v.item() if isinstance(v, torch.Tensor) else float(v) for v in (*tangents, *center))
-        if self.model == SPHERE:  # a pixel is 2 tanfovy / height radians high
-            return Lens(SPHERE, self.coefficients, math.pi / 2 - min(tan_y / height, 1.5))
-        reach = _C.lens_reach(self.model, self.numbers(), tan_x, tan_y, x, y)
+        reach = _C.lens_reach(self.model, self.numbers(), tan_x, tan_y, x, y, height or 0)
         return Lens(self.model, self.coefficients, reach)
 
     @property

@@ -75,8 +75,6 @@ template <typename T> AR_HD Vec3<T> scale_of(Vec3<T> logs) {
 
 template <typename T> AR_HD T opacity_of(T logit) { return T(1) / (T(1) + std::exp(-logit)); }
 
-template <typename T> AR_HD T dot(Vec4<T> a, Vec4<T> b) { return a.x * b.x + a.y * b.y + a.z * b.z + a.w * b.w; }
-
 template <typename T> AR_HD Vec4<T> rotation_of(Vec4<T> q) {
   const T length = max(sqrt(dot(q, q)), T(kMinQuaternionLength));
   return {q.x / length, q.y / length, q.z / length, q.w / length};

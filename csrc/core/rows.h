@@ -1,5 +1,5 @@
-// The rows of the public stages: what is written of a projected Gaussian (write_row, write_no_row), which Gaussians
-// have one (measure_row), and the adjoint of its depths. A library for cpu/project.h and cuda/project*.cuh.
+// The rows of the public stages: which Gaussians have one (measure_row), what is written of them (write_row_or_flag),
+// and the adjoint of its depths. A library for cpu/project.h and cuda/project*.cuh.
 #pragma once
 
 #include "core/project.h"
@@ -96,6 +96,31 @@ template <typename T> AR_HD void write_no_row(const RowOutputs<T>& to, int64_t r
   const T zero = T(0);
   const ProjectedGaussian<T> nothing = {{-to.center, -to.center}, {zero, zero, zero, T(-1)}, zero, zero};
   write_row(to, row, gaussian, nothing, {zero, zero, zero}, zero, 0, RowMeasure<T>{});
+}
+
+/// Writes what `project_rows` writes of Gaussian i but packed rows: its row, or only the flag of whether it has one.
+/// `radius`: as above; 0: it is not drawn, and neither `view`, the mean in camera space, nor `p` is read. Gives `p` the
+/// depth of the row.
+template <class Cam, typename T>
+AR_HD void write_row_or_flag(const Cam& camera, const RowRules<T>& rules, const RowOutputs<T>& to, int32_t* flags,
+                             int64_t i, Vec3<T> view, ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
+  RowMeasure<T> measure = {};
+  bool drawn = radius > 0;
+  if (drawn) p.depth = order_depth(rules.order, camera, view);
+  if (drawn && rules.measured) {
+    measure = measure_row(p, rules, camera.grid);
+    drawn = measure.drawn;
+  }
+  if (flags) {
+    flags[i] = drawn;
+    return;
+  }
+  const int64_t row = to.places.of(i);
+  if (drawn) {
+    write_row(to, row, i, p, color, to.shows_depth ? depth_by(rules.shown, camera, view) : T(0), radius, measure);
+  } else if (!to.places.ends) {
+    write_no_row(to, row, i);
+  }
 }
 
 template <typename T> AR_HD bool has_gradient(const ProjectedRowGrads<T>& rows, int64_t row) {

@@ -69,7 +69,7 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
   for_each_chunk(g.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
-      ProjectedGaussian<T> projected;
+      ProjectedGaussian<T> projected = {};
       ProjectedMean<T> mean = {};
       SplatRow<T> splat = {};
       int radius = 0;
@@ -84,24 +84,7 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
         if (projects) write_packed(p.packed, i, projected, splat.color, radius);
         continue;
       }
-      RowMeasure<T> measure = {};
-      bool drawn = radius > 0;
-      if (drawn) projected.depth = order_depth(p.rules.order, camera, mean.view);
-      if (drawn && p.rules.measured) {
-        measure = measure_row(projected, p.rules, camera.grid);
-        drawn = measure.drawn;
-      }
-      if (p.flags) {
-        p.flags[i] = drawn;
-        continue;
-      }
-      const int64_t row = p.rows.places.of(i);
-      if (drawn) {
-        const T shown = p.rows.shows_depth ? depth_by(p.rules.shown, camera, mean.view) : T(0);
-        write_row(p.rows, row, i, projected, splat.color, shown, radius, measure);
-      } else if (!p.rows.places.ends) {
-        write_no_row(p.rows, row, i);
-      }
+      write_row_or_flag(camera, p.rules, p.rows, p.flags, i, mean.view, projected, splat.color, radius);
     }
   });
 }

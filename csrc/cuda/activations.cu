@@ -14,72 +14,34 @@ namespace {
 
 constexpr int kThreads = kActivateThreads, kWarps = kThreads / 32;
 
-/// In thread 0 of a block of kThreads, in a fixed order. All threads call it, once in a kernel.
-template <typename T> __device__ T block_sum(T own) {
-  __shared__ T of_warps[kWarps];
-  own = warp_sum(own);
-  if (lane_id() == 0) of_warps[threadIdx.x / 32] = own;
-  __syncthreads();
-  T sum = T(0);
-  if (threadIdx.x == 0) {
-    for (int w = 0; w < kWarps; ++w) sum += of_warps[w];
-  }
-  return sum;
-}
-
 // T: float or double. Arrays have a row for each of p.n Gaussians.
 /// block_sums: [blocks]; null: no penalty is wanted.
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p, T* block_sums) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const T own = i < p.n ? ar::activate(p, i) : T(0);
+  T sum[] = {i < p.n ? ar::activate(p, i) : T(0)};
   if (!block_sums) return;
-  const T sum = block_sum(own);
-  if (threadIdx.x == 0) block_sums[blockIdx.x] = sum;
+  sum_block<kWarps>(sum);
+  if (threadIdx.x == 0) block_sums[blockIdx.x] = sum[0];
 }
 
 /// One block.
 template <typename T> __global__ void sum_penalty_kernel(const T* block_sums, int64_t blocks, T* penalty) {
   wait_for_earlier_kernels();
-  double own = 0;
-  for (int64_t i = threadIdx.x; i < blocks; i += kThreads) own += double(block_sums[i]);
-  const double sum = block_sum(own);
-  if (threadIdx.x == 0) *penalty = T(sum);
+  double sum[] = {0};
+  for (int64_t i = threadIdx.x; i < blocks; i += kThreads) sum[0] += double(block_sums[i]);
+  sum_block<kWarps>(sum);
+  if (threadIdx.x == 0) *penalty = T(sum[0]);
 }
 
-template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
+/// kBody: of core/, for Gaussian i.
+template <class Params, void (*kBody)(const Params&, int64_t)> __global__ void each_gaussian_kernel(const Params p) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::activate_vjp(p, i);
+  if (i < p.n) kBody(p, i);
 }
-
-template <typename T> __global__ void apply_filter_kernel(const FilterParams<T> p) {
-  wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::apply_filter(p, i);
-}
-
-template <typename T> __global__ void apply_filter_vjp_kernel(const FilterVjpParams<T> p) {
-  wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::apply_filter_vjp(p, i);
-}
-
-template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
-  wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::observe(p, i);
-}
-
-template <typename T> __global__ void add_noise_kernel(const NoiseParams<T> p) {
-  wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < p.n) ar::add_noise(p, i);
-}
-
-/// A thread for each Gaussian.
-template <class Params> void launch_over_gaussians(void (*kernel)(const Params), const Params& p, cudaStream_t stream) {
-  if (p.n > 0) launch(kernel, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+template <auto kBody, class Params> void launch_over_gaussians(const Params& p, cudaStream_t stream) {
+  if (p.n > 0) launch(each_gaussian_kernel<Params, kBody>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 
 }  // namespace
@@ -92,19 +54,19 @@ template <typename T> void activate(const ActivateParams<T>& p, T* block_sums, c
   if (p.penalty) launch(sum_penalty_kernel<T>, {1, kThreads}, stream, block_sums, blocks, p.penalty);
 }
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
-  launch_over_gaussians(activate_vjp_kernel<T>, p, stream);
+  launch_over_gaussians<ar::activate_vjp<T>>(p, stream);
 }
 template <typename T> void apply_filter(const FilterParams<T>& p, cudaStream_t stream) {
-  launch_over_gaussians(apply_filter_kernel<T>, p, stream);
+  launch_over_gaussians<ar::apply_filter<T>>(p, stream);
 }
 template <typename T> void apply_filter_vjp(const FilterVjpParams<T>& p, cudaStream_t stream) {
-  launch_over_gaussians(apply_filter_vjp_kernel<T>, p, stream);
+  launch_over_gaussians<ar::apply_filter_vjp<T>>(p, stream);
 }
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream) {
-  launch_over_gaussians(observe_kernel<T>, p, stream);
+  launch_over_gaussians<ar::observe<T>>(p, stream);
 }
 template <typename T> void add_noise(const NoiseParams<T>& p, cudaStream_t stream) {
-  launch_over_gaussians(add_noise_kernel<T>, p, stream);
+  launch_over_gaussians<ar::add_noise<T>>(p, stream);
 }
 
 template void activate(const ActivateParams<float>&, float*, cudaStream_t);

@@ -132,24 +132,7 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
     if (projects) write_packed(params.packed, i, projected, splat.color, radius);
     return;
   }
-  RowMeasure<float> measure = {};
-  bool drawn = radius > 0;
-  if (drawn) projected.depth = order_depth(params.rules.order, camera, mean.view);
-  if (drawn && params.rules.measured) {
-    measure = measure_row(projected, params.rules, camera.grid);
-    drawn = measure.drawn;
-  }
-  if (params.flags) {
-    params.flags[i] = drawn;
-    return;
-  }
-  const int64_t row = to.places.of(i);
-  if (drawn) {
-    const float shown = to.shows_depth ? depth_by(params.rules.shown, camera, mean.view) : 0;
-    write_row(to, row, i, projected, splat.color, shown, radius, measure);
-  } else if (!to.places.ends) {
-    write_no_row(to, row, i);
-  }
+  write_row_or_flag(camera, params.rules, to, params.flags, i, mean.view, projected, splat.color, radius);
 }
 
 /// A thread per public row. Writes a splat and what bin reads.

@@ -96,24 +96,6 @@ __device__ void for_each_pixel(Position position, int height, int width, const B
   }
 }
 
-/// For the first thread.
-template <typename T> __device__ void sum_block(T& a, T& b) {
-  constexpr int kWarps = kThreads / 32;
-  __shared__ T of_warps[kWarps][2];
-  a = warp_sum(a);
-  b = warp_sum(b);
-  if (lane_id() == 0) {
-    of_warps[threadIdx.x / 32][0] = a;
-    of_warps[threadIdx.x / 32][1] = b;
-  }
-  __syncthreads();
-  if (threadIdx.x > 0) return;
-  for (int w = 1; w < kWarps; ++w) {
-    a += of_warps[w][0];
-    b += of_warps[w][1];
-  }
-}
-
 /// image, target, map: [planes, height, width]; partials: [kSsimPartials, planes, height, width]. block_sums: [blocks,
 /// 2] for sums of |x - y| and of the similarity. The last three may be null. Target: T or uint8_t.
 template <typename T, typename Target>
@@ -175,10 +157,11 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
     ssim_sum += s.value;
   });
   if (!block_sums) return;
-  sum_block(l1_sum, ssim_sum);
+  T sums_of_block[] = {l1_sum, ssim_sum};
+  sum_block<kThreads / 32>(sums_of_block);
   if (threadIdx.x == 0) {
-    block_sums[2 * int64_t(blockIdx.x)] = l1_sum;
-    block_sums[2 * int64_t(blockIdx.x) + 1] = ssim_sum;
+    block_sums[2 * int64_t(blockIdx.x)] = sums_of_block[0];
+    block_sums[2 * int64_t(blockIdx.x) + 1] = sums_of_block[1];
   }
 }
 
@@ -186,13 +169,12 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
   wait_for_earlier_kernels();
-  double l1_sum = 0, ssim_sum = 0;
+  double sums[] = {0, 0};  // of L1 and of similarities
   for (int64_t i = threadIdx.x; i < blocks; i += kThreads) {
-    l1_sum += double(block_sums[2 * i]);
-    ssim_sum += double(block_sums[2 * i + 1]);
+    for (int k = 0; k < 2; ++k) sums[k] += double(block_sums[2 * i + k]);
   }
-  sum_block(l1_sum, ssim_sum);
-  if (threadIdx.x == 0) *p.loss = combined_loss(p, l1_sum, ssim_sum);
+  sum_block<kThreads / 32>(sums);
+  if (threadIdx.x == 0) *p.loss = combined_loss(p, sums[0], sums[1]);
 }
 
 /// As ssim_kernel; dL_dmap, dL_dimage: [planes, height, width].

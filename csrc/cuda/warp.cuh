@@ -1,5 +1,5 @@
-// A library for all kernels: sums, votes and searches over a warp, which all lanes must call; and loads, stores and
-// copies of single lanes.
+// A library for all kernels: sums, votes and searches over a warp, which all lanes must call; sums over a block; and
+// loads, stores and copies of single lanes.
 #pragma once
 
 #include <cstdint>
@@ -15,6 +15,22 @@ template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
   return v;
+}
+
+/// Sums over a block of kWarps warps, in a fixed order, for its first thread. All threads call it, once in a kernel.
+template <int kWarps, int kCount, typename T> __device__ void sum_block(T (&sums)[kCount]) {
+  __shared__ T of_warps[kWarps][kCount];
+#pragma unroll
+  for (int k = 0; k < kCount; ++k) {
+    sums[k] = warp_sum(sums[k]);
+    if (lane_id() == 0) of_warps[threadIdx.x / 32][k] = sums[k];
+  }
+  __syncthreads();
+  if (threadIdx.x > 0) return;
+  for (int w = 1; w < kWarps; ++w) {
+#pragma unroll
+    for (int k = 0; k < kCount; ++k) sums[k] += of_warps[w][k];
+  }
 }
 
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }

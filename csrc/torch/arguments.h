@@ -2,7 +2,6 @@
 // and reads the dispatcher's stack with it. check() (checks.h) brings tensors into the form that kernels read.
 #pragma once
 
-#include <array>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -132,12 +131,7 @@ struct PrepareLensArguments {
   int64_t height = 0;           ///< Of the picture, px.
   bool centered = false;        ///< `center` is the middle of the picture by the matrices.
 
-  std::array<OptionalTensor*, 8> members() {
-    return {&tanfovx, &tanfovy, &aperture, &focus, &shift, &turn, &screen, &distortion};
-  }
-  template <class Visit> void each(Visit&& visit) {
-    visit("viewmatrix", viewmatrix);
-    visit("projmatrix", projmatrix);
+  template <class Visit> void each_part(Visit&& visit) {
     visit("tanfovx", tanfovx);
     visit("tanfovy", tanfovy);
     visit("aperture", aperture);
@@ -146,6 +140,11 @@ struct PrepareLensArguments {
     visit("turn", turn);
     visit("screen", screen);
     visit("distortion", distortion);
+  }
+  template <class Visit> void each(Visit&& visit) {
+    visit("viewmatrix", viewmatrix);
+    visit("projmatrix", projmatrix);
+    each_part(visit);
     visit("numbers", numbers);
     visit("height", height);
     visit("centered=False", centered);
@@ -177,6 +176,8 @@ struct ProjectArguments : BatchArguments {
   bool keep = false;
 
   bool is_table() const { return !table.empty(); }
+  int64_t batches() const { return means3D.dim() == 3 ? means3D.size(0) : 1; }
+  int64_t cameras() const { return viewmatrix.size(0); }  ///< After check_cameras().
   template <class Visit> void each(Visit&& visit) {
     BatchArguments::each(visit);
     visit("values=None", values);
@@ -305,109 +306,6 @@ struct WeightArguments : FootprintArguments {
   }
 };
 
-struct SsimArguments {
-  Tensor image;   ///< (..., H, W).
-  Tensor target;  ///< The same, or uint8. Has no gradient.
-  bool keep = false;
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("image", image);
-    visit("target", target);
-    visit("keep=False", keep);
-  }
-};
-
-/// l1_weight * (mean |image - target|) + ssim_weight * (mean similarity) + constant.
-struct L1SsimArguments : SsimArguments {
-  double l1_weight = 0, ssim_weight = 0, constant = 0;
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("image", image);
-    visit("target", target);
-    visit("l1_weight", l1_weight);
-    visit("ssim_weight", ssim_weight);
-    visit("constant", constant);
-    visit("keep=False", keep);
-  }
-};
-
-struct ActivateArguments {
-  Tensor log_scales, quats, logit_opacities;
-  double opacity_weight = 0, scale_weight = 0;  ///< Of the penalty.
-  bool has_penalty() const { return opacity_weight != 0 || scale_weight != 0; }
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("log_scales", log_scales);
-    visit("quats", quats);
-    visit("logit_opacities", logit_opacities);
-    visit("opacity_weight=0.0", opacity_weight);
-    visit("scale_weight=0.0", scale_weight);
-  }
-};
-
-/// See core/activations.h.
-struct FilterArguments {
-  Tensor scales;
-  Tensor opacities;  ///< (P,) or (P, 1).
-  Tensor filter_3d;  ///< (P,).
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("scales", scales);
-    visit("opacities", opacities);
-    visit("filter_3d", filter_3d);
-  }
-};
-
-/// See core/color_correction.h.
-struct CorrectArguments {
-  Tensor image;   ///< (3, H, W).
-  Tensor matrix;  ///< (3, 4).
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("image", image);
-    visit("matrix", matrix);
-  }
-};
-
-struct PictureArguments : CameraNumbers<double>, FootprintArguments {
-  Tensor means, log_scales, quats, logit_opacities, shs;
-  int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.
-  Tensor target, dL_dloss;   ///< As of `l1_ssim`.
-  OptionalTensor exposure;   ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor mask;       ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
-  double ssim_weight = 0;
-  Tensor bg, viewmatrix, projmatrix, campos;
-  OptionalTensor lens;
-  OptionalTensor filter_3d;   ///< (N,), that of `apply_3d_filter`.
-  int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
-  double opacity_weight = 0, scale_weight = 0;  ///< Of the mean opacity and scale, before the filter, in the loss.
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("means", means);
-    visit("log_scales", log_scales);
-    visit("quats", quats);
-    visit("logit_opacities", logit_opacities);
-    visit("shs", shs);
-    visit("mean_columns", mean_columns);
-    visit("target", target);
-    visit("dL_dloss", dL_dloss);
-    visit("exposure", exposure);
-    visit("mask", mask);
-    visit("ssim_weight", ssim_weight);
-    visit("bg", bg);
-    visit("viewmatrix", viewmatrix);
-    visit("projmatrix", projmatrix);
-    visit("campos", campos);
-    visit("lens", lens);
-    each_number(visit);
-    FootprintArguments::each(visit);
-    visit("filter_3d=None", filter_3d);
-    visit("supersampling=1", supersampling);
-    visit("opacity_weight=0.0", opacity_weight);
-    visit("scale_weight=0.0", scale_weight);
-  }
-};
-
 /// An op writes to them. The schema marks each by its own letter.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 template <char kLetter> struct WrittenTensor : Tensor {};
@@ -416,72 +314,6 @@ template <char kLetter> struct WrittenTensor : Tensor {};
 inline void note_written(const Tensor& t) {
   if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
-
-/// See core/density.h.
-struct ObserveArguments {
-  WrittenTensor<'a'> gradient_sums;
-  WrittenTensor<'b'> views;
-  Tensor gradients;  ///< (P, 3) or (P, 4), of means2D.
-  Tensor radii;
-  int64_t first_column = 0;  ///< Two columns of `gradients` are read.
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("gradient_sums", gradient_sums);
-    visit("views", views);
-    visit("gradients", gradients);
-    visit("radii", radii);
-    visit("first_column", first_column);
-  }
-};
-
-/// See core/density.h.
-struct NoiseArguments {
-  WrittenTensor<'a'> means;  ///< Any strides.
-  Tensor log_scales, quats, logit_opacities;
-  Tensor normals;  ///< (N, 3).
-  double strength = 0;
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("means", means);
-    visit("log_scales", log_scales);
-    visit("quats", quats);
-    visit("logit_opacities", logit_opacities);
-    visit("normals", normals);
-    visit("strength", strength);
-  }
-};
-
-/// A step on several tensors (core/adam.h).
-struct AdamArguments {
-  WrittenTensors<'a'> params;  ///< Any strides, as all others.
-  std::vector<Tensor> grads;
-  WrittenTensors<'b'> exp_avgs;
-  WrittenTensors<'c'> exp_avg_sqs;
-  std::vector<double> rates;
-  std::vector<int64_t> steps;  ///< 1 for the first.
-  double beta1 = 0, beta2 = 0, eps = 0;
-  OptionalTensor rows;  ///< (P,) bool or uint8.
-  bool bias_correction = true;
-  /// The first heads[i] numbers of a row have the rate head_rates[i].
-  std::vector<int64_t> heads;
-  std::vector<double> head_rates;
-
-  template <class Visit> void each(Visit&& visit) {
-    visit("params", params);
-    visit("grads", grads);
-    visit("exp_avgs", exp_avgs);
-    visit("exp_avg_sqs", exp_avg_sqs);
-    visit("rates", rates);
-    visit("steps", steps);
-    visit("beta1", beta1);
-    visit("beta2", beta2);
-    visit("eps", eps);
-    visit("rows=None", rows);
-    visit("bias_correction=True", bias_correction);
-    visit("heads=[]", heads);
-    visit("head_rates=[]", head_rates);
-  }
-};
 
 /// Rows from `room` on are not written.
 struct PackArguments : BatchArguments {

@@ -9,7 +9,7 @@
 #include <string_view>
 #include <vector>
 
-#include "torch/arguments.h"
+#include "torch/training_arguments.h"
 
 namespace ar::ops {
 

@@ -3,12 +3,15 @@
 // lens alone is found once for that lens, where the host knows its numbers; otherwise the device finds it in every
 // frame.
 #include <ATen/Dispatch.h>
-#include <ATen/ops/isfinite.h>
-#include <ATen/ops/zeros.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
 #include <ATen/ops/zeros_like.h>
+#include <c10/util/StringUtil.h>
 
 #include <algorithm>
 #include <array>
+#include <cstddef>
+#include <iterator>
 #include <map>
 #include <mutex>
 #include <sstream>
@@ -27,25 +30,18 @@
 namespace ar::ops {
 namespace {
 
-template <class... M> double number_of_model(const std::string& name, CameraModelList<M...>) {
-  const std::array<const char*, sizeof...(M)> names = {M::kName...};
-  for (size_t k = 0; k < names.size(); ++k) {
-    if (name == names[k]) return double(k);
-  }
-  std::string known;
-  for (const char* one : names) known += (known.empty() ? "" : ", ") + std::string(one);
-  TORCH_CHECK_VALUE(false, "model must be one of ", known, ", got '", name, "'");
-}
-template <class... M> std::string name_of_model(double number, CameraModelList<M...>) {
-  const std::array<const char*, sizeof...(M)> names = {M::kName...};
-  return names[std::min(size_t(number), names.size() - 1)];
+double number_of_model(const std::string& name) {
+  const auto& names = kCameraModelNames;
+  const auto found = std::find(names.begin(), names.end(), name);
+  TORCH_CHECK_VALUE(found != names.end(), "model must be one of ", c10::Join(", ", names), ", got '", name, "'");
+  return double(found - names.begin());
 }
 
 Lens<double> lens_of(const std::string& model, const std::vector<double>& distortion) {
   TORCH_CHECK_VALUE(distortion.size() == size_t(kDistortion), "coefficients must be ", kDistortion, " numbers, got ",
                     distortion.size());
   Lens<double> lens = {};
-  lens.model = number_of_model(model, CameraModels());
+  lens.model = number_of_model(model);
   std::copy(distortion.begin(), distortion.end(), lens.distortion);
   return lens;
 }
@@ -98,8 +94,8 @@ double fold_of(const Lens<double>& lens) {
   if (fold > 0) return fold;
   std::ostringstream numbers;
   for (int k = 0; k < kDistortion; ++k) numbers << (k ? ", " : "") << lens.distortion[k];
-  TORCH_CHECK_VALUE(false, "the ", name_of_model(lens.model, CameraModels()), " lens with coefficients (",
-                    numbers.str(), ") is no map at its axis");
+  TORCH_CHECK_VALUE(false, "the ", kCameraModelNames.at(size_t(lens.model)), " lens with coefficients (", numbers.str(),
+                    ") is no map at its axis");
 }
 
 /// The number that reach_of() takes, of a lens with center and tangents.
@@ -124,8 +120,7 @@ int seen_of(const Lens<double>& lens, double fold) {
 template <class Source> void prepare_on_cpu(const Source& source) {
   for (int c = 0; c < source.count; ++c) {
     const Lens<double> lens = source.lens(c);
-    const bool finds = finds_fold(source) || finds_reach(source);
-    const double fold = source.limits.fold > 0 || !finds ? source.limits.fold : fold_of(lens);
+    const double fold = finds_fold(source) ? fold_of(lens) : source.limits.fold;
     write_lens(source, c, fold, finds_reach(source) ? seen_of(lens, fold) : -1);
     source.write_matrices(c);
   }
@@ -148,9 +143,7 @@ void check(PrepareCamerasArguments& a) {
   a.intrinsics = a.intrinsics.contiguous();
   like.check_rows_of(a.coefficients, "coefficients", {kDistortion}, "(C, 12)");
   check_image_size(a.height, a.width);
-  const Lens<double> lens = lens_of(a.model, std::vector<double>(kDistortion));
-  const LimitKind kind = limit_kind(lens);
-  const bool has_map = kind == LimitKind::kTangent || kind == LimitKind::kAngle;
+  const bool has_map = may_fold(limit_kind(lens_of(a.model, std::vector<double>(kDistortion))));
   TORCH_CHECK_VALUE(a.far > a.near, "far must be above near, ", a.near, ", got ", a.far);
   TORCH_CHECK_VALUE(has_map == a.coefficients.has_value(), "coefficients must be given for a lens, and only then; got ",
                     a.coefficients ? "some" : "none", " for the model ", a.model);
@@ -168,7 +161,7 @@ template <typename T> CameraSource<T> source_of(const PrepareCamerasArguments& a
   source.numbers.focus = 1;
   source.numbers.near = a.near;
   source.numbers.far = a.far;
-  source.numbers.model = number_of_model(a.model, CameraModels());
+  source.numbers.model = number_of_model(a.model);
   source.limits.height = int(a.height);
   return source;
 }
@@ -234,24 +227,36 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> arguments) {
 
 namespace {
 
+using L = Lens<float>;
+/// Numbers of a lens, and how many an argument has, in the order of PrepareLensArguments::each_part().
+struct LensPart {
+  size_t offset;
+  int64_t count;
+
+  int64_t first() const { return int64_t(offset / sizeof(float)); }
+};
+constexpr LensPart kLensParts[] = {
+    {offsetof(L, tan_half_fov), 1}, {offsetof(L, tan_half_fov) + sizeof(float), 1},
+    {offsetof(L, aperture), 1},     {offsetof(L, focus), 1},
+    {offsetof(L, shift), 3},        {offsetof(L, turn), 3},
+    {offsetof(L, screen), 2},       {offsetof(L, distortion), kDistortion},
+};
+
 void check(PrepareLensArguments& a) {
   check_floating(a.viewmatrix, "viewmatrix");
-  Like{a.viewmatrix, "viewmatrix"}.check_matrix(a.viewmatrix, "viewmatrix");
   const Like like{a.viewmatrix, "viewmatrix"};
+  like.check_matrix(a.viewmatrix, "viewmatrix");
   like.check_matrix(a.projmatrix, "projmatrix");
   TORCH_CHECK_VALUE(a.numbers.size() == size_t(kLensWidth), "numbers must be ", kLensWidth, " numbers, got ",
                     a.numbers.size());
-  constexpr std::array<const char*, 8> kNames = {"tanfovx", "tanfovy", "aperture", "focus",
-                                                 "shift",   "turn",    "screen",   "distortion"};
-  constexpr std::array<int64_t, 8> kSizes = {1, 1, 1, 1, 3, 3, 2, kDistortion};
-  const auto members = a.members();
-  for (size_t k = 0; k < members.size(); ++k) {
-    if (!*members[k]) continue;
-    Tensor& t = **members[k];
-    like.check_type(t, kNames[k]);
-    TORCH_CHECK_VALUE(t.numel() == kSizes[k], kNames[k], " must have ", kSizes[k], " numbers, got shape ", shape_of(t));
-    t = t.contiguous();
-  }
+  const LensPart* part = kLensParts;
+  a.each_part([&](const char* name, OptionalTensor& t) {
+    const int64_t count = part++->count;
+    if (!t) return;
+    like.check_type(*t, name);
+    TORCH_CHECK_VALUE(t->numel() == count, name, " must have ", count, " numbers, got shape ", shape_of(*t));
+    t = t->contiguous();
+  });
 }
 
 /// `out` may be undefined.
@@ -260,17 +265,20 @@ template <typename T> LensSource<T> source_of(PrepareLensArguments& a, const Ten
   std::copy(a.numbers.begin(), a.numbers.end(), &source.numbers.tan_half_fov.x);
   source.limits = {source.numbers.fold, source.numbers.reach, int(a.height)};
   LensTensors<T>& t = source.tensors;
-  const T** pointers[] = {&t.tan_half_fov_x, &t.tan_half_fov_y, &t.aperture, &t.focus,
-                          &t.shift,          &t.turn,           &t.screen,   &t.distortion};
-  const auto members = a.members();
-  for (size_t k = 0; k < members.size(); ++k) *pointers[k] = const_pointer<T>(*members[k]);
+  t.tan_half_fov_x = const_pointer<T>(a.tanfovx);
+  t.tan_half_fov_y = const_pointer<T>(a.tanfovy);
+  t.aperture = const_pointer<T>(a.aperture);
+  t.focus = const_pointer<T>(a.focus);
+  t.shift = const_pointer<T>(a.shift);
+  t.turn = const_pointer<T>(a.turn);
+  t.screen = const_pointer<T>(a.screen);
+  t.distortion = const_pointer<T>(a.distortion);
   const LimitKind kind = limit_kind(source.numbers);
   if (a.centered || kind != LimitKind::kNone) {
     t.view = const_pointer<T>(a.viewmatrix);
     t.proj = const_pointer<T>(a.projmatrix);
   }
-  const bool known = kind == LimitKind::kTangent || kind == LimitKind::kAngle;
-  if (known && !a.distortion && !(source.limits.fold > 0)) source.limits.fold = fold_of(source.numbers);
+  if (finds_fold(source) && !a.distortion) source.limits.fold = fold_of(source.numbers);
   source.out = pointer<T>(out);
   return source;
 }
@@ -288,8 +296,7 @@ Results prepare_lens(PrepareLensArguments a) {
 Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> arguments) {
   PrepareLensArguments& a = arguments.of_op;
   check(a);
-  const auto members = a.members();
-  check_needs(arguments.needs, 2 + members.size());
+  check_needs(arguments.needs, 2 + std::size(kLensParts));
   const Tensor by_lens = only_gradient_of(arguments.dL_doutputs, "lens", a.viewmatrix, {kLensWidth});
   Tensor by_view, by_proj;
   AT_DISPATCH_FLOATING_TYPES(a.viewmatrix.scalar_type(), "prepare_lens_vjp", [&] {
@@ -306,19 +313,13 @@ Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> arguments) {
   });
   std::vector<Tensor> out = {or_empty(arguments.needs[0] ? by_view : Tensor(), by_lens),
                              or_empty(arguments.needs[1] ? by_proj : Tensor(), by_lens)};
-  using L = Lens<float>;
-  constexpr std::array<size_t, 8> kOffsets = {offsetof(L, tan_half_fov), offsetof(L, tan_half_fov) + sizeof(float),
-                                              offsetof(L, aperture),     offsetof(L, focus),
-                                              offsetof(L, shift),        offsetof(L, turn),
-                                              offsetof(L, screen),       offsetof(L, distortion)};
-  for (size_t k = 0; k < members.size(); ++k) {
+  const LensPart* part = kLensParts;
+  a.each_part([&](const char*, const OptionalTensor& t) {
     Tensor grad;
-    if (arguments.needs[2 + k] && *members[k]) {
-      const Tensor& t = **members[k];
-      grad = by_lens.narrow(0, int64_t(kOffsets[k] / sizeof(float)), t.numel()).clone().view(t.sizes());
-    }
+    if (arguments.needs[out.size()] && t) grad = by_lens.narrow(0, part->first(), part->count).clone().view(t->sizes());
     out.push_back(or_empty(grad, by_lens));
-  }
+    ++part;
+  });
   return {out};
 }
 
@@ -327,12 +328,15 @@ double lens_fold(const std::string& model, const std::vector<double>& distortion
 }
 
 double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
-                  double y) {
+                  double y, int height) {
   Lens<double> lens = lens_of(model, distortion);
   lens.tan_half_fov = {tan_x, tan_y};
   lens.center = {x, y};
+  const LimitKind kind = limit_kind(lens);
+  TORCH_CHECK_VALUE(kind != LimitKind::kLatitude || height > 0, "height must be positive for the ", model,
+                    " lens, got ", height);
   const double fold = fold_of(lens);
-  return reach_of(limit_kind(lens), fold, seen_of(lens, fold));
+  return reach_of(kind, lens, fold, may_fold(kind) ? seen_of(lens, fold) : -1, height);
 }
 
 std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<double> distortion, const Tensor& points) {

@@ -1,10 +1,18 @@
-// Cameras on CUDA, for cameras.cpp; cameras_cuda.cpp implements it.
+// Names of camera models; and cameras on CUDA, for cameras.cpp, which cameras_cuda.cpp implements.
 #pragma once
+
+#include <array>
 
 #include "core/camera/prepare.h"
 #include "torch/pointers.h"
 
 namespace ar::ops {
+
+template <class... M> constexpr std::array<const char*, sizeof...(M)> names_of_models(CameraModelList<M...>) {
+  return {M::kName...};
+}
+/// By the number of the model.
+inline constexpr auto kCameraModelNames = names_of_models(CameraModels());
 
 /// On the device of `like`. Never waits for it.
 template <class Source> void prepare_on_cuda(const Source& source, const Tensor& like);

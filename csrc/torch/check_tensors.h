@@ -1,5 +1,5 @@
-// Checks of shapes, dtypes and devices: a library for checks.cpp, training_checks.cpp and packed.cpp, so that messages
-// have one wording. A wrong dtype raises TypeError, anything else ValueError.
+// Checks of shapes, dtypes and devices: a library for all files with checks, so that messages have one wording. A wrong
+// dtype raises TypeError, anything else ValueError.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// checks.h for the rendering ops, and find_footprint(). check_tensors.h words the messages. training_checks.cpp has the
-// other ops.
+// checks.h for the rendering ops, and find_footprint(). check_tensors.h words the messages. batches.cpp has
+// arguments of several cameras, training_checks.cpp the other ops.
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>
@@ -222,98 +222,6 @@ void check_values(const RasterizeArguments& a) {
   if (a.debug) check_gaussians(a);
   if (a.debug && a.features) check_finite(*a.features, "features");
   if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
-}
-
-namespace {
-
-int64_t batches_of(const ProjectArguments& a) { return a.means3D.dim() == 3 ? a.means3D.size(0) : 1; }
-int64_t cameras_of(const ProjectArguments& a) { return a.viewmatrix.size(0); }
-
-/// A tensor of all batches has `dims` + 1 dimensions; of `by_camera` too.
-void check_batches(const ProjectArguments& a, const OptionalTensor& t, const char* name, int64_t dims, bool by_camera) {
-  if (!t || (t->dim() == dims && batches_of(a) == 1) || t->dim() < dims) return;
-  const bool ok = t->dim() == dims + 1 && (t->size(0) == batches_of(a) || (by_camera && t->size(0) == cameras_of(a)));
-  TORCH_CHECK_VALUE(ok, name, " must have a part for each of ", batches_of(a), " batches",
-                    by_camera ? " or for each camera" : "", ", got shape ", shape_of(*t));
-}
-
-}  // namespace
-
-ProjectArguments batch_of(const BatchArguments& a) {
-  ProjectArguments out;
-  static_cast<BatchArguments&>(out) = a;
-  return out;
-}
-
-int64_t check_cameras(ProjectArguments& a) {
-  check_shape((a.means3D.dim() == 2 || a.means3D.dim() == 3) && a.means3D.size(-1) == 3, a.means3D, "means3D",
-              "(P, 3)");
-  for (Tensor* matrix : {&a.viewmatrix, &a.projmatrix}) {
-    if (matrix->dim() == 2) *matrix = matrix->unsqueeze(0);
-  }
-  if (a.campos.dim() == 1) a.campos = a.campos.unsqueeze(0);
-  if (a.lens && a.lens->dim() == 1) a.lens = a.lens->unsqueeze(0);
-  const bool ok = a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4;
-  check_shape(ok, a.viewmatrix, "viewmatrix", "(C, 4, 4)");
-  const int64_t cameras = cameras_of(a), batches = batches_of(a);
-  check_rows(a.projmatrix, "projmatrix", cameras, {4, 4}, "(C, 4, 4)");
-  check_rows(a.campos, "campos", cameras, {3}, "(C, 3)");
-  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, ("(C, " + std::to_string(kLensWidth) + ")").c_str());
-  TORCH_CHECK_VALUE(int64_t(a.tanfovx.size()) == cameras && int64_t(a.tanfovy.size()) == cameras,
-                    "tanfovx and tanfovy must have a number for each of ", cameras, " cameras, got ", a.tanfovx.size(),
-                    " and ", a.tanfovy.size());
-  TORCH_CHECK_VALUE(!(a.shs && a.colors_precomp), "at most one of shs and colors_precomp must be given, got both");
-  TORCH_CHECK_VALUE(!a.colors_precomp || (a.colors_precomp->dim() == 2 && a.colors_precomp->size(1) == 3),
-                    "colors_precomp must have shape (P, 3), got ", a.colors_precomp ? shape_of(*a.colors_precomp) : "");
-  TORCH_CHECK_VALUE(batches > 0 && cameras % batches == 0, "viewmatrix must have as many cameras for each of ", batches,
-                    " batches, got ", cameras);
-  check_batches(a, a.shs, "shs", 3, true);
-  check_batches(a, a.scales, "scales", 2, false);
-  check_batches(a, a.rotations, "rotations", 2, false);
-  check_batches(a, a.cov3D_precomp, "cov3D_precomp", 2, false);
-  if (batches > 1) check_batches(a, a.opacities, "opacities", 1, false);
-  TORCH_CHECK_VALUE(!a.is_table() || a.measured, "measured must be True for a table, got False");
-  TORCH_CHECK_VALUE(!a.is_table() || c10::multiply_integers(a.table) == cameras * a.means3D.size(-2),
-                    "table must be the sizes of ", cameras * a.means3D.size(-2), " rows, got ", text_of(a.table));
-  if (!a.values) return cameras;
-  check_batches(a, a.values, "values", 2, true);
-  const Like like{a.means3D, "means3D"};
-  like.check_type(*a.values, "values");
-  const int64_t p = a.means3D.size(-2), colors = a.shs || a.colors_precomp ? 3 : 0;
-  const bool fits = a.values->dim() >= 2 && a.values->size(-2) == p && a.values->size(-1) >= 1 &&
-                    a.values->size(-1) + colors + (a.shown != "none") <= kMaxChannels;
-  check_shape(fits, *a.values, "values", "(P, K) with P = ", p, " and at most ", kMaxChannels, " features in all");
-  return cameras;
-}
-
-Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims) {
-  if (!t.defined() || t.dim() == dims) return t;
-  return t.select(0, t.size(0) == cameras_of(a) ? c : c / (cameras_of(a) / batches_of(a)));
-}
-
-Inputs inputs_of(const ProjectArguments& a, int64_t c) {
-  const auto part = [&](const OptionalTensor& t, int64_t dims) -> OptionalTensor {
-    return t ? OptionalTensor(part_of(a, c, *t, dims)) : std::nullopt;
-  };
-  Inputs in;
-  in.means3D = part_of(a, c, a.means3D, 2);
-  in.opacities = a.means3D.dim() == 3 ? part_of(a, c, a.opacities, 1) : a.opacities;
-  in.shs = part(a.shs, 3);
-  in.colors_precomp = a.colors_precomp;
-  in.scales = part(a.scales, 2);
-  in.rotations = part(a.rotations, 2);
-  in.cov3D_precomp = part(a.cov3D_precomp, 2);
-  in.viewmatrix = a.viewmatrix[c];
-  in.projmatrix = a.projmatrix[c];
-  in.campos = a.campos[c];
-  if (a.lens) in.lens = (*a.lens)[c];
-  in.image_height = a.image_height;
-  in.image_width = a.image_width;
-  in.tanfovx = a.tanfovx[c];
-  in.tanfovy = a.tanfovy[c];
-  in.scale_modifier = a.scale_modifier;
-  in.sh_degree = a.sh_degree;
-  return in;
 }
 
 void check(BinArguments& a) {

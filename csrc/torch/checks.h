@@ -3,6 +3,7 @@
 #pragma once
 
 #include "torch/backend.h"
+#include "torch/training_arguments.h"
 
 namespace ar::ops {
 
@@ -34,7 +35,9 @@ ProjectArguments batch_of(const BatchArguments& a);
 Inputs inputs_of(const ProjectArguments& a, int64_t c);
 /// The part that camera c reads of a tensor whose rows have `dims` dimensions in one batch.
 Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims);
-/// The same of `t`, which is `values` or like it.
+/// Of all tensors of Gaussians, which have the shapes of those of `a`. T: Tensor or OptionalTensor.
+template <class T> void take_parts(const ProjectArguments& a, int64_t c, SceneTensors<T>& of);
+/// Of `t`, which is `values` or like it.
 inline Tensor values_of(const ProjectArguments& a, int64_t c, const Tensor& t) { return part_of(a, c, t, 2); }
 /// What these rely on. Matrices of a single camera may lack the first dimension. Returns the number of cameras.
 int64_t check_cameras(ProjectArguments& a);

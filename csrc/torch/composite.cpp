@@ -1,14 +1,12 @@
 // The op `composite`, rows of one or several cameras to their images: what `bin` and `blend` do one after the other
 // (stages.cpp), with channels last. And its adjoint.
-#include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/where.h>
-#include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
-#include <array>
+#include <utility>
 #include <vector>
 
-#include "torch/check_tensors.h"
+#include "torch/camera_rows.h"
 #include "torch/checks.h"
 #include "torch/ops.h"
 #include "torch/scene_grads.h"
@@ -23,26 +21,14 @@ struct CameraRows {
   RowTensors rows;
   ChannelTensors channels;
 
-  CameraRows(const CompositeArguments& a, int64_t c) {
-    const int64_t* splits = a.row_splits.const_data_ptr<int64_t>();
-    const auto part = [&](const Tensor& t) {
-      return a.row_splits.numel() == 2 ? t : t.slice(0, splits[c], splits[c + 1]);
-    };
-    rows.means2d = part(a.means2d);
-    rows.cov2d = part(a.cov2d);
-    rows.dets = part(a.dets);
-    rows.opacities = part(a.opacities);
-    rows.depths = part(a.depths);
+  CameraRows(const CompositeArguments& a, int64_t c)
+      : rows(shapes_of(a, c)),
+        channels(row_channels(rows_of(a.features, a.row_splits, c), a.background->select(0, c))) {
+    rows.depths = rows_of(a.depths, a.row_splits, c);
     rows.center = a.center;
-    channels.by_gaussian = false;
-    channels.count = channels.color_channels = a.features.size(1);
-    channels.background = a.background->select(0, c);
-    const Tensor features = part(a.features);
     if (channels.count == 3) {  // In the splats themselves, where they take least time.
-      rows.colors = features;
+      std::swap(rows.colors, channels.rows);
       rows.any_color = true;
-    } else {
-      channels.rows = features;
     }
   }
 };
@@ -127,17 +113,16 @@ Results composite_vjp(VjpArguments<CompositeArguments> arguments) {
     if (dL_dalpha.defined()) gradient.others[kAlpha] = dL_dalpha[c].squeeze(2);
     const PairSums sums = backend->blend_vjp(lists, state, pass, part.channels, gradient,
                                              absolute ? MeanSums::kAbsolute : MeanSums::kNone);
-    const int64_t* splits = a.row_splits.const_data_ptr<int64_t>() + c;
-    const auto rows_of = [&](const Tensor& t) { return t.defined() ? t.slice(0, splits[0], splits[1]) : t; };
+    const auto part_of = [&](const Tensor& t) { return rows_of(t, a.row_splits, c); };
     RowTensors grads;
-    grads.means2d = rows_of(all.means2d);
-    grads.cov2d = rows_of(all.cov2d);
-    grads.opacities = rows_of(all.opacities);
-    grads.absolute = rows_of(all.absolute);
-    if (channels == 3) grads.colors = rows_of(all.colors);
+    grads.means2d = part_of(all.means2d);
+    grads.cov2d = part_of(all.cov2d);
+    grads.opacities = part_of(all.opacities);
+    grads.absolute = part_of(all.absolute);
+    if (channels == 3) grads.colors = part_of(all.colors);
     backend->row_grads(part.rows, lists, pass, sums, grads);
     if (channels != 3 && cameras == 1) dL_dfeatures = sums.dL_dchannels;
-    if (channels != 3 && cameras != 1) rows_of(all.colors).copy_(sums.dL_dchannels);
+    if (channels != 3 && cameras != 1) part_of(all.colors).copy_(sums.dL_dchannels);
     if (dL_dbackground.defined())
       dL_dbackground[c].copy_(background_grad(gradient.color, part.channels.background, state, pass.grid));
   }

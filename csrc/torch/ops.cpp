@@ -6,14 +6,12 @@
 
 #include <algorithm>
 #include <cstddef>
-#include <limits>
 #include <new>
 #include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
-#include "core/camera.h"
 #include "core/footprint/registry.h"
 #include "core/project.h"
 #include "core/sh.h"
@@ -21,6 +19,7 @@
 #include "cpu/stages.h"
 #include "torch/backend.h"
 #include "torch/call.h"
+#include "torch/cameras.h"
 #include "torch/ops.h"
 
 namespace ar::ops {
@@ -150,8 +149,6 @@ template <size_t kCount> std::vector<std::string> names_of(const std::array<cons
   return names;
 }
 
-template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
-
 /// Bounds of how far splats reach with a footprint: variance that it adds [px^2], level at opacity 1, and a factor for
 /// rounding. A splat of variance v and opacity a shows within factor * sqrt((v + variance) * (level + max(0, 2 log a)))
 /// of its mean along an axis, or 2 px more.
@@ -263,9 +260,11 @@ PYBIND11_MODULE(_C, m) {
   m.def("lens_points", &ar::ops::lens_points,
         "Positions and derivatives of points through a lens (csrc/torch/cameras.cpp).");
   m.def("lens_fold", &ar::ops::lens_fold, "The angle up to which a lens is a map (csrc/torch/cameras.cpp).");
-  m.def("lens_reach", &ar::ops::lens_reach, "The angle up to which a picture sees, and more (csrc/torch/cameras.cpp).");
+  m.def("lens_reach", &ar::ops::lens_reach, "The angle up to which a picture sees, and more (csrc/torch/cameras.cpp).",
+        pybind11::arg("model"), pybind11::arg("distortion"), pybind11::arg("tan_x"), pybind11::arg("tan_y"),
+        pybind11::arg("x"), pybind11::arg("y"), pybind11::arg("height") = 0);
   m.def("reach_bounds", &ar::ops::reach_bounds, "Bounds of how far splats reach (csrc/torch/ops.cpp).");
-  m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
+  m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::ops::kCameraModelNames);
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();
   m.attr("KEPT_ROWS") = ar::ops::member_names<ar::ops::KeptRows>();

@@ -27,11 +27,11 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> a);
 /// lens (kLensWidth,).
 Results prepare_lens(PrepareLensArguments a);
 Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> a);
-/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped in a picture. Both are found
-/// once for a lens.
+/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped in a picture of `height` px,
+/// which only an equirectangular lens needs. Both are found once for a lens.
 double lens_fold(const std::string& model, const std::vector<double>& distortion);
 double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
-                  double y);
+                  double y, int height);
 /// What a lens makes of points (N, 3): see lens_points in Python.
 std::pair<Tensor, Tensor> lens_points(const std::string& model, std::vector<double> distortion, const Tensor& points);
 

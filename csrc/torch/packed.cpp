@@ -132,9 +132,10 @@ Results pack_rows_vjp(PackVjpArguments a) {
   TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
   ProjectedGrads dL_drows;
   dL_drows.packed = a.dL_drows;
-  return {gradients_of(batch, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+  const std::unique_ptr<Backend> backend = make_backend(a.means3D);
+  return {gradients_of(*backend, batch, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     dL_drows.rows = row_of_gaussians(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
-    return make_backend(in.means3D)->project_rows_vjp(in, dL_drows, grads);
+    return backend->project_rows_vjp(in, dL_drows, grads);
   })};
 }
 

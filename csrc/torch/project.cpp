@@ -1,15 +1,14 @@
 // The op `project`, Gaussians and cameras to rows, and its adjoint. Rows are packed, one for every Gaussian that a
 // camera may see, for which the host waits once for their number; or a table with a place for every Gaussian in every
 // camera.
-#include <ATen/ops/cat.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
 #include <array>
-#include <limits>
 #include <vector>
 
+#include "torch/camera_rows.h"
 #include "torch/check_tensors.h"
 #include "torch/checks.h"
 #include "torch/ops.h"
@@ -26,7 +25,7 @@ DepthKind depth_kind_of(const std::string& name, const char* argument) {
   TORCH_CHECK_VALUE(false, argument, " must be none, model, z or distance, got ", name);
 }
 
-RowRules<double> rules_of(const ProjectArguments& a, const Pass& pass) {
+RowRules<double> rules_of(const ProjectArguments& a) {
   RowRules<double> rules;
   rules.order = depth_kind_of(a.order, "order");
   TORCH_CHECK_VALUE(rules.order != DepthKind::kNone, "order must be model, z or distance, got none");
@@ -84,7 +83,7 @@ ProjectedTensors make_rows(int64_t n, const Columns& columns, const ProjectArgum
 Results project(ProjectArguments a) {
   const Pass pass(a, a.means3D);
   const int64_t cameras = check_cameras(a);
-  const RowRules<double> rules = rules_of(a, pass);
+  const RowRules<double> rules = rules_of(a);
   const Columns columns(a);
   const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
   std::vector<Inputs> inputs;
@@ -124,8 +123,8 @@ Results project(ProjectArguments a) {
     backend->project_rows(inputs[c], pass, rules, rows);
     if (columns.values == 0) continue;
     const Tensor values = values_of(a, c, *a.values);
-    const Tensor to = rows.features.slice(0, splits[c], splits[c + 1]).narrow(1, columns.colors, columns.values);
-    to.copy_(a.is_table() ? values : values.index_select(0, rows.gaussian_ids.slice(0, splits[c], splits[c + 1])));
+    const Tensor to = rows_of(rows.features, row_splits, c).narrow(1, columns.colors, columns.values);
+    to.copy_(a.is_table() ? values : values.index_select(0, rows_of(rows.gaussian_ids, row_splits, c)));
   }
   const auto or_none = [&](const Tensor& t) { return or_empty(t, a.means3D); };
   const auto or_no_ints = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, ints); };
@@ -191,7 +190,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   const bool of_values = needs.back() && a.values;
   needs.pop_back();
   const std::unique_ptr<Backend> backend = make_backend(a.means3D);
-  std::vector<Tensor> out = gradients_of(a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+  std::vector<Tensor> out = gradients_of(*backend, a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     dL_drows.first = splits.const_data_ptr<int64_t>()[c];
     dL_drows.last = splits.const_data_ptr<int64_t>()[c + 1];
     if (!a.is_table()) dL_drows.ends = places[c];
@@ -202,13 +201,12 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   if (of_values) {
     dL_dvalues = at::zeros_like(*a.values, at::MemoryFormat::Contiguous);
     for (int64_t c = 0; c < cameras && dL_drows.features.defined(); ++c) {
-      const int64_t* at = splits.const_data_ptr<int64_t>() + c;
-      const Tensor rows = dL_drows.features.slice(0, at[0], at[1]).narrow(1, columns.colors, columns.values);
+      const Tensor rows = rows_of(dL_drows.features, splits, c).narrow(1, columns.colors, columns.values);
       Tensor to = values_of(a, c, dL_dvalues);
       if (a.is_table()) {
         to.add_(rows);
       } else {  // Once for each Gaussian: in a fixed order.
-        to.index_add_(0, arguments.saved[2].slice(0, at[0], at[1]), rows);
+        to.index_add_(0, rows_of(arguments.saved[2], splits, c), rows);
       }
     }
   }

@@ -62,12 +62,12 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
   return list;
 }
 
-std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> needs,
+std::vector<Tensor> gradients_of(Backend& backend, const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint) {
   check_needs(needs, kSceneTensors - 1);
   needs.insert(needs.begin() + 1, false);  // means2D
   check_camera_needs(needs, a.lens);
-  const int64_t cameras = a.viewmatrix.size(0), batches = a.means3D.dim() == 3 ? a.means3D.size(0) : 1;
+  const int64_t cameras = a.cameras(), batches = a.batches();
   Inputs all;
   static_cast<SceneTensors<OptionalTensor>&>(all) = a;
   const Grads sums = make_grads(all, needs);
@@ -78,15 +78,10 @@ std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> ne
     Inputs in = inputs_of(a, c);
     check(in);
     Grads grads = sums;
-    grads.means3D = part_of(a, c, sums.means3D, 2);
-    if (a.means3D.dim() == 3) grads.opacities = part_of(a, c, sums.opacities, 1);
-    grads.shs = part_of(a, c, sums.shs, 3);
-    grads.scales = part_of(a, c, sums.scales, 2);
-    grads.rotations = part_of(a, c, sums.rotations, 2);
-    grads.cov3D_precomp = part_of(a, c, sums.cov3D_precomp, 2);
+    take_parts<Tensor>(a, c, grads);
     grads.add = c % (cameras / batches) > 0;
     const Tensor camera = adjoint(c, in, grads);
-    if (grads.with_camera) set_camera_grads(*make_backend(in.means3D), camera, needs, grads);
+    if (grads.with_camera) set_camera_grads(backend, camera, needs, grads);
     const std::vector<Tensor> list = list_of(grads, in.means3D);
     for (size_t k = 0; k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
   }

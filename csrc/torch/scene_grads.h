@@ -24,7 +24,7 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like);
 
 /// Gradients with respect to the tensors of BatchArguments: summed over cameras for Gaussians, and stacked for cameras.
 /// `a`: after check_cameras(). `adjoint`: Backend::project_rows_vjp of one camera.
-std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> needs,
+std::vector<Tensor> gradients_of(Backend& backend, const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint);
 
 /// Whether `ids` are in [0, count). Always true on CUDA, where the host would wait.

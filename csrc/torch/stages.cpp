@@ -1,27 +1,20 @@
 // The stages after `project` as separate ops, for one or several cameras: bin, blend and its adjoint. And
 // footprint_weight. They call a Backend (backend.h) camera by camera, and return lists camera after camera.
 #include <ATen/ops/cat.h>
-#include <ATen/ops/full_like.h>
 #include <ATen/ops/stack.h>
-#include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
 #include <array>
 #include <vector>
 
+#include "torch/camera_rows.h"
 #include "torch/checks.h"
 #include "torch/ops.h"
 #include "torch/scene_grads.h"
 
 namespace ar::ops {
 namespace {
-
-/// The rows of camera `c`.
-Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
-  const int64_t* splits = row_splits.const_data_ptr<int64_t>();
-  return t.slice(0, splits[c], splits[c + 1]);
-}
 
 Tensor join(const std::vector<Tensor>& parts) { return parts.size() == 1 ? parts[0] : at::cat(parts); }
 
@@ -33,16 +26,10 @@ struct CameraPart {
   RowTensors rows;
   ChannelTensors channels;
 
-  CameraPart(const BlendArguments& a, int64_t c) : lists(from_list<ListTensors>(a.lists, c * ListTensors::kMembers)) {
-    rows.means2d = rows_of(a.means2d, a.row_splits, c);
-    rows.cov2d = rows_of(a.cov2d, a.row_splits, c);
-    rows.dets = rows_of(a.dets, a.row_splits, c);
-    rows.opacities = rows_of(a.opacities, a.row_splits, c);
-    channels.rows = rows_of(a.features, a.row_splits, c);
-    channels.by_gaussian = false;
-    channels.count = channels.color_channels = a.features.size(1);
-    channels.background = a.background[c];
-  }
+  CameraPart(const BlendArguments& a, int64_t c)
+      : lists(from_list<ListTensors>(a.lists, c * ListTensors::kMembers)),
+        rows(shapes_of(a, c)),
+        channels(row_channels(rows_of(a.features, a.row_splits, c), a.background[c])) {}
 };
 
 }  // namespace
@@ -54,8 +41,8 @@ Results bin(BinArguments a) {
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   std::vector<Tensor> out;
   for (int64_t c = 0; c + 1 < a.row_splits.size(0); ++c) {
-    RowTensors rows = {a.means2d, a.cov2d, a.dets, a.opacities, a.depths, Tensor()};
-    for (Tensor* t : rows.numbers()) *t = rows_of(*t, a.row_splits, c);
+    RowTensors rows = shapes_of(a, c);
+    rows.depths = rows_of(a.depths, a.row_splits, c);
     append_to(out, backend->bin(backend->shape_rows(rows, pass), pass));
   }
   return {out};

@@ -10,7 +10,7 @@
 #include "core/color_correction.h"
 #include "core/density.h"
 #include "core/ssim.h"
-#include "torch/arguments.h"
+#include "torch/training_arguments.h"
 
 namespace ar::ops {
 

@@ -30,6 +30,8 @@ template <typename T> AR_HD LimitKind limit_kind(const Lens<T>& lens) {
   return visit_model_at(lens.model, CameraModels(),
                         [](auto model) AR_HD_LAMBDA { return limit_kind_of<decltype(model)>(); });
 }
+/// Whether there is a fold to be found: the model has coefficients.
+AR_HD bool may_fold(LimitKind kind) { return kind == LimitKind::kTangent || kind == LimitKind::kAngle; }
 AR_HD double widest_angle(LimitKind kind) { return kind == LimitKind::kAngle ? kPi - 1e-3 : kWidestPerspective; }
 /// As the kernels read it.
 AR_HD double measured(LimitKind kind, double angle) {
@@ -84,9 +86,11 @@ template <class Find> AR_HD double fold_in_direction(LimitKind kind, const Find&
   return first;
 }
 
-/// `seen`: the number of the last of the angles up to `fold` that is nearer to the axis than the farthest corner, in
-/// any direction, since a strip of a picture may lie between the rays; -1: none.
-AR_HD double reach_of(LimitKind kind, double fold, int seen) {
+/// Of a picture of `height` px. `seen`: the number of the last of the angles up to `fold` that is nearer to the axis
+/// than the farthest corner, in any direction, since a strip of a picture may lie between the rays; -1: none.
+AR_HD double reach_of(LimitKind kind, const Lens<double>& lens, double fold, int seen, int height) {
+  if (kind == LimitKind::kLatitude)  // a pixel is 2 tan_half_fov.y / height radians high: half a pixel from the poles
+    return kPi / 2 - min(lens.tan_half_fov.y / height, 1.5);
   const double largest = seen < 0 ? fold : limit_angle(0, fold, min(seen + 1, kLimitAngles));
   const double wider = kind == LimitKind::kAngle ? kFrustumClamp * largest
                                                  : std::atan(kFrustumClamp * std::tan(min(largest, kWidestMeasured)));
@@ -95,10 +99,6 @@ AR_HD double reach_of(LimitKind kind, double fold, int seen) {
 AR_HD double corner_distance(const Lens<double>& lens) {
   const double x = abs(lens.center.x) + lens.tan_half_fov.x, y = abs(lens.center.y) + lens.tan_half_fov.y;
   return sqrt(x * x + y * y);
-}
-/// Of an equirectangular picture, whose pixel is 2 tan_half_fov.y / height radians high: half a pixel from the poles.
-AR_HD double latitude_reached(const Lens<double>& lens, int height) {
-  return kPi / 2 - min(lens.tan_half_fov.y / height, 1.5);
 }
 
 }  // namespace ar

@@ -7,9 +7,6 @@
 
 namespace ar {
 
-AR_HD Vec4<double> operator*(double s, Vec4<double> v) { return {s * v.x, s * v.y, s * v.z, s * v.w}; }
-AR_HD double dot(Vec4<double> a, Vec4<double> b) { return a.x * b.x + a.y * b.y + a.z * b.z + a.w * b.w; }
-
 inline constexpr double kClipNear = 0.01, kClipFar = 100;  ///< of clip-space z, which nothing reads
 
 /// What is known of the limits of lenses, rad; the rest is found (limits.h).
@@ -249,10 +246,7 @@ template <class Source> AR_HD void write_lens(const Source& source, int c, doubl
   const KnownLimits& known = source.limits;
   if (kind != LimitKind::kNone) {
     if (known.fold > 0) fold = known.fold;
-    const double reach = known.reach > 0                ? known.reach
-                         : kind == LimitKind::kLatitude ? latitude_reached(lens, known.height)
-                                                        : reach_of(kind, fold, seen);
-    lens.reach = measured(kind, reach);
+    lens.reach = measured(kind, known.reach > 0 ? known.reach : reach_of(kind, lens, fold, seen, known.height));
     // Of a lens that is no map nothing is seen.
     lens.fold = kind == LimitKind::kLatitude ? 0 : fold > 0 ? measured(kind, fold) : -1;
   }
@@ -263,12 +257,10 @@ template <class Source> AR_HD void write_lens(const Source& source, int c, doubl
 
 /// What has to be found of a source before write_lens().
 template <class Source> bool finds_fold(const Source& source) {
-  const LimitKind kind = limit_kind(source.numbers);
-  return (kind == LimitKind::kTangent || kind == LimitKind::kAngle) && !(source.limits.fold > 0);
+  return may_fold(limit_kind(source.numbers)) && !(source.limits.fold > 0);
 }
 template <class Source> bool finds_reach(const Source& source) {
-  const LimitKind kind = limit_kind(source.numbers);
-  return (kind == LimitKind::kTangent || kind == LimitKind::kAngle) && !(source.limits.reach > 0);
+  return may_fold(limit_kind(source.numbers)) && !(source.limits.reach > 0);
 }
 
 }  // namespace ar
