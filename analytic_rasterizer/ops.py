@@ -20,10 +20,15 @@ class Op:
     """An operator, called by names of arguments in a fraction of the time of torch.ops.
 
     The quicker way is not known to torch.compile, nor to what overrides functions of torch, which get the other one.
+
+    Attributes:
+        results: Names of what it returns, in order.
     """
 
     def __init__(self, name: str):
         self._name, self._quick = name, _C.Call(name)
+        schema = getattr(torch.ops.analytic_rasterizer, name).default._schema
+        self.results = tuple(result.name for result in schema.returns)
 
     def __call__(self, **arguments: Any) -> tuple:
         if torch.compiler.is_compiling() or has_torch_function(tuple(arguments.values())):

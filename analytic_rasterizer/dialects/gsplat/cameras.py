@@ -51,7 +51,7 @@ def prepared_cameras(
         RuntimeError: On the CPU, a pose that is singular.
     """
     model = _MODELS[camera_model] if coefficients is None else _LENSES[camera_model]
-    results = _prepare(
+    made = _prepare(
         views=viewmats,
         intrinsics=intrinsics,
         coefficients=coefficients,
@@ -61,4 +61,4 @@ def prepared_cameras(
         near=near,
         far=far,
     )
-    return dict(zip(("viewmatrix", "projmatrix", "campos", "lens"), results))
+    return dict(zip(_prepare.results, made))

@@ -22,8 +22,6 @@ _AT_ONCE = 3  # channels of harmonics that `project` evaluates
 # peak is below 1, which the radii leave out: they are bounds.
 _PIXEL_VARIANCE = 1 / 12
 _CENTER = 0.5  # px, where gsplat has the centre of the first pixel
-_NAMES = ("means2d", "cov2d", "opacities", "depths", "features", "radii", "gaussian_ids", "camera_ids", "row_splits")
-_NAMES += ("dets", "conics", "shown_opacities")  # of the results of `project`, in order
 _project, _composite = Op("project"), Op("composite")
 
 
@@ -78,7 +76,7 @@ class Scene:
         dims, count = len(self.sizes.batch), math.prod(self.sizes.batch) * self.sizes.cameras
         filters = self.footprint.name in (DILATED, COMPENSATED)
         flat = {name: flattened(value, value.dim() - dims) for name, value in self.gaussians.items()}
-        results = _project(
+        made = _project(
             **{name: flat.get(name) for name in ("means3D", "opacities", "scales", "rotations", "cov3D_precomp")},
             shs=None if shs is None else self._by_group(shs, 3),
             colors_precomp=None,
@@ -103,7 +101,7 @@ class Scene:
             far=self.planes[1],
             radius_clip=self.radius_clip,
         )
-        return dict(zip(_NAMES, results))
+        return dict(zip(_project.results, made))
 
     def _shown(self, mode: Mode) -> str:
         """The kind of depth that is rendered."""
@@ -125,13 +123,15 @@ class Scene:
         if len(parts) < 2:
             return parts[0] if parts else None
         if len({part.shape[:-1] for part in parts}) > 1:  # some are per camera
-            dims, cameras = len(self.sizes.batch), self.sizes.cameras
-            parts = [
-                (s.values if s.per_camera else s.values.unsqueeze(dims).expand(*s.values.shape[:dims], cameras, -1, -1))
-                .flatten(0, dims)
-                for s in given
-            ]  # fmt: skip
+            parts = [self._by_camera(signal) for signal in given]
         return torch.cat(parts, -1)
+
+    def _by_camera(self, signal: Signal) -> torch.Tensor:
+        """(B * C, N, D) values of a signal without harmonics."""
+        dims, values = len(self.sizes.batch), signal.values
+        if not signal.per_camera:
+            values = values.unsqueeze(dims).expand(*values.shape[:dims], self.sizes.cameras, -1, -1)
+        return values.flatten(0, dims)
 
     def _harmonics(self, signal: Signal) -> Signal:
         """(..., C, N, D) sums of harmonics plus 1/2, which colours clamp at zero and extra signals do not.
@@ -151,7 +151,8 @@ class Scene:
             sums = torch.where(above["features"] > 0, above["features"], 1 - below["features"])[:, :count]
             found = above["radii"].reshape(-1, 2)[:, :1] > 0
             parts.append(torch.where(found, sums, torch.nan))
-        return self._per_camera(torch.cat(parts, 1))
+        shape = (*self.sizes.batch, self.sizes.cameras, self.sizes.gaussians)
+        return Signal(torch.cat(parts, 1).unflatten(0, shape), None, per_camera=True)
 
     def _normals(self) -> Signal:
         """(..., C, N, 3) third axes of the Gaussians in the world; of the two opposite ones that which faces the
@@ -165,12 +166,6 @@ class Scene:
             rays = of_camera[..., None, :] if orthographic else means - of_camera[..., None, :]
             parts.append(torch.where((axes * rays).sum(-1, keepdim=True) > 0, -axes, axes))
         return Signal(torch.stack(parts, -3), None, True)
-
-    def _per_camera(self, rows: torch.Tensor) -> Signal:
-        """Rows of a table as a signal."""
-        return Signal(
-            rows.unflatten(0, (*self.sizes.batch, self.sizes.cameras, self.sizes.gaussians)), None, per_camera=True
-        )
 
 
 def composite(
