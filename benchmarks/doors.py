@@ -3,12 +3,12 @@
     python benchmarks/doors.py SCENE --views VIEWS [--footprint box:samples=1] [--doors plain stages ...]
     python benchmarks/doors.py --tiny
 
-A row is a door. All take turns, round after round, each with a call that is not timed before one that is, so that no
-row pays for the one before it; medians over rounds, averaged over views. "forward" is without gradient; "f+b" also
+A row is a door. The doors take turns in every round. A call that is not timed precedes a timed one, so that no door
+pays for another. Numbers are medians over rounds, averaged over views. "forward" is without gradient. "f+b" also
 computes the gradient of sum(image * w), for fixed random w, with respect to all inputs. "/base" is the ratio to the row
-"plain"; of defocus and motion to plain frames of Gaussians enlarged until there are as many pairs. Rows with * are
-gsplat's own `rasterization`, where gsplat is installed and there is a CUDA device; "/gsplat" is the ratio of our row of
-the same call to it. With "4 cameras" a call renders this view and the three that follow.
+"plain". Defocus and motion are compared with plain frames of Gaussians enlarged until there are as many pairs. Rows
+with * are gsplat's own `rasterization`, where gsplat is installed and there is a CUDA device. "/gsplat" is the ratio of
+our row to gsplat's row of the same call. With "4 cameras" a call renders this view and the three that follow.
 
 With CUDA "ms" is between two events around a call on an idle device, and "host" until the call returns, without
 waiting. "events" are kernels, copies and fills on the device by torch's profiler. "used" and "reserved" are the peaks

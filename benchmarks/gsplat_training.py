@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from captures import add_capture, load_train_and_test
 from common import has_cuda, peaks_of_memory, start_peaks
 
 from analytic_rasterizer.analysis.tables import format_table
@@ -25,12 +26,12 @@ from analytic_rasterizer.analysis.timing import describe_machine
 from analytic_rasterizer.dialects import gsplat as ours
 from analytic_rasterizer.io import View
 from analytic_rasterizer.losses import l1_ssim
-from analytic_rasterizer.training import TrainingOptions, load_capture, load_pictures
+from analytic_rasterizer.training import TrainingOptions, load_capture
 from analytic_rasterizer.training.evaluation import psnr
 from analytic_rasterizer.training.extent import extent_of
 from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.schedule import Clock, PictureOrder
-from analytic_rasterizer.training.start import background_of, starting_gaussians
+from analytic_rasterizer.training.start import starting_gaussians
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 """Of 3DGS; that of the means per unit of the extent, and falling to a hundredth."""
@@ -55,11 +56,7 @@ def main() -> int:
     options = TrainingOptions(
         iterations=args.iterations, scales=(args.scale,), seed=args.seed, random_points=args.random_points
     )
-    background = background_of(options, capture.background)
-    train, test = (
-        load_pictures(items, options.scales, background, args.device) for items in (capture.train, capture.test)
-    )
-    print(f"{args.scene}, {len(train.views)} pictures, {len(test.views)} for the test, {describe_machine(args.device)}")
+    background, train, test = load_train_and_test(args, capture, options)
     rows = {
         name: Training(calls[name], options, capture, train, background, args).run(test) for name in args.rasterizer
     }
@@ -73,8 +70,7 @@ def main() -> int:
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add = parser.add_argument
-    add("scene", type=Path, help="folder of a capture")
-    add("--images", default="images", help="folder in it of a reconstruction's photographs")
+    add_capture(parser)
     add("--rasterizer", nargs="+", choices=("ours", "gsplat"), default=["ours"], help="(default: %(default)s)")
     add("--scale", type=int, default=1, help="of the pictures: 2 is half the size (default: %(default)s)")
     add("--iterations", type=int, default=7000, help="(default: %(default)s)")

@@ -28,12 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from captures import add_capture, load_train_and_test
 from common import has_cuda, peaks_of_memory, start_peaks
 from tqdm import tqdm
 
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture, load_pictures
+from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture
 from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.options import DOWNSAMPLINGS, PRESETS, preset_values
 from analytic_rasterizer.training.schedule import Clock
@@ -85,13 +86,7 @@ def main() -> int:
     if not capture.test:
         print(f"error: {args.scene}: there are no test pictures", file=sys.stderr)
         return 2
-    scales = args.common["scales"]
-    background = background_of(TrainingOptions(**args.common), capture.background)
-    train, test = (
-        load_pictures(items, scales, background, args.device, args.downsampling)
-        for items in (capture.train, capture.test)
-    )
-    print(f"{args.scene}, {len(train.views)} pictures, {len(test.views)} for the test, {describe_machine(args.device)}")
+    _, train, test = load_train_and_test(args, capture, TrainingOptions(**args.common))
     report = {"machine": describe_machine(args.device), "torch": torch.__version__, "scene": str(args.scene)}
     report["runs"] = runs = []
     for seed in args.seeds:
@@ -99,15 +94,14 @@ def main() -> int:
             runs.append({"variant": name, "seed": seed, **train_once(options[name], seed, capture, train, test, args)})
             if args.json:
                 write_json(args.json, report)
-    print(format_runs(runs, scales))
+    print(format_runs(runs, args.common["scales"]))
     return 0
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add = parser.add_argument
-    add("scene", type=Path, help="folder of a capture")
-    add("--images", default="images", help="folder in it of a reconstruction's photographs")
+    add_capture(parser)
     add("--variants", nargs="+", metavar="NAME", help="(default: all)")
     add("--more", type=Path, metavar="FILE.json", help="further variants")
     add("--seeds", type=int, nargs="+", default=[0])
