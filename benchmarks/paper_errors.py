@@ -1,15 +1,28 @@
-"""`errors`: the error of every footprint's weight."""
+"""The paper's error analysis: the error of every footprint's weight and gradients.
+
+    python benchmarks/paper_errors.py --out errors
+
+Writes plots, CSV files and summary.md to the folder. docs/accuracy.md has results.
+"""
 
 from __future__ import annotations
 
-from ..analysis import errors
-from .arguments import count, use_machine, writable_folder
+import argparse
+import sys
+
+from paper import errors
+
+from analytic_rasterizer.cli.arguments import Parser, count, run_command, use_machine, writable_folder
 
 
-def add_parser(subcommands) -> None:
-    parser = subcommands.add_parser(
-        "errors",
-        help="measure the error of every footprint's weight and gradients",
+def main(argv: list[str] | None = None) -> int:
+    """Runs the analysis; returns the exit code, 2 after an error that the user can correct."""
+    return run_command(lambda: make_parser().parse_args(argv))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of this program."""
+    parser = Parser(
         description="The paper's error analysis: the logistic window against erf, the turned pixel against Monte Carlo "
         "and the exact integral, and both errors of every footprint from 0.02 to 20 px. Writes plots (.png, .svg), "
         ".csv files and summary.md to DIR, and prints the summary.",
@@ -22,6 +35,7 @@ def add_parser(subcommands) -> None:
     add("--monte-carlo", type=count, default=errors.MONTE_CARLO, metavar="N", help=monte_carlo)
     add("--threads", type=count, metavar="N", help="CPU threads (default: all)")
     parser.set_defaults(run=run, device="cpu")
+    return parser
 
 
 def run(args) -> None:
@@ -30,3 +44,7 @@ def run(args) -> None:
     out = writable_folder(args.out)
     print(errors.run(out, args.samples, args.monte_carlo)["summary"])
     print(f"see the plots and tables in {out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,20 +1,32 @@
-"""`tables`: the tables of the paper, trained and tested here."""
+"""The tables of the paper, trained and tested by this package.
+
+    python benchmarks/paper_tables.py
+    python benchmarks/paper_tables.py blender-mtmt --data nerf_synthetic --out results --rows analytic moment
+
+The first line lists the tables, the second trains and tests two rows of one. docs/tables.md describes them.
+"""
 
 from __future__ import annotations
 
+import argparse
 import sys
 
-from .. import io
-from ..training import load_lpips
-from ..training.options import PRESETS
-from ..training.tables import PUBLISHED, TABLES, Table, run_table, text
-from .arguments import add_machine_options, count, use_machine
+from paper import PUBLISHED, TABLES, Table, run_table, text
+
+from analytic_rasterizer import io
+from analytic_rasterizer.cli.arguments import Parser, add_machine_options, count, run_command, use_machine
+from analytic_rasterizer.training import load_lpips
+from analytic_rasterizer.training.options import PRESETS
 
 
-def add_parser(subcommands) -> None:
-    parser = subcommands.add_parser(
-        "tables",
-        help="repeat the tables of the paper",
+def main(argv: list[str] | None = None) -> int:
+    """Runs what is asked for; returns the exit code: 0, 2 after an error, 130 when interrupted."""
+    return run_command(lambda: make_parser().parse_args(argv))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of this program."""
+    parser = Parser(
         description="Train and test all that a table of the paper shows, and print our rows beside the paper's. "
         "Nothing is downloaded; scenes that are not in FOLDER are skipped. What is complete is not done again: the "
         "same command goes on after an interruption. Writes NAME.md, NAME.json and the trainings to DIR. Without "
@@ -32,6 +44,7 @@ def add_parser(subcommands) -> None:
     add("--no-lpips", action="store_true", help="leave out LPIPS")
     add_machine_options(parser)
     parser.set_defaults(run=run)
+    return parser
 
 
 def run(args) -> None:
@@ -41,7 +54,7 @@ def run(args) -> None:
         return
     missing = [text for name, text in (("data", "--data FOLDER"), ("out", "--out DIR")) if getattr(args, name) is None]
     if missing:
-        raise ValueError(f"tables {args.name} needs {' and '.join(missing)}")
+        raise ValueError(f"{args.name} needs {' and '.join(missing)}")
     use_machine(args)
     lpips = None
     if not args.no_lpips:
@@ -88,3 +101,7 @@ def _sizes(scales: tuple[int, ...]) -> str:
 
 def _fraction(scale: int) -> str:
     return "1" if scale == 1 else f"1/{scale}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

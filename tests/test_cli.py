@@ -236,8 +236,13 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
         (["render", "{}", "--out", "{}/out"], "a folder without a scene: expected scene.ply with options.json, which"),
         (["evaluate", "{}/nosuch"], "nosuch: no such file or folder"),
         (["bake", "{}/nosuch", "--out", "a.ply"], "nosuch: no such file or folder"),
-        (["tables", "360-stst", "--data", "{}"], "tables 360-stst needs --out DIR"),
-        (["tables", "360-stst"], "tables 360-stst needs --data FOLDER and --out DIR"),
+        (["tables"], "tables has moved: in a clone of the repository, run python benchmarks/paper_tables.py"),
+        (["tables", "360-stst", "--data", "{}"], "run python benchmarks/paper_tables.py"),
+        (
+            ["errors", "--out", "{}"],
+            "errors has moved: in a clone of the repository, run python benchmarks/paper_err",
+        ),
+        (["errors", "--help"], "run python benchmarks/paper_errors.py"),
         (
             ["view", "a.ply", "--footprint", "exact"],
             "; with --server every footprint can be shown",
@@ -488,7 +493,7 @@ def test_without_a_command_it_says_what_is_installed(capsys):
     assert second.startswith(f"torch {torch.__version__} with ")
     assert re.fullmatch(r"    pip install --index-url INDEX/pt\d+(cpu|cu\d+) analytic-rasterizer", line)
     assert "--help" in last
-    for args in ([], ["render"], ["errors"], ["pareto"], ["inspect"]):
+    for args in ([], ["render"], ["pareto"], ["inspect"]):
         args = [*args, "--help"]
         assert leave(args) == 0
         text = capsys.readouterr().out

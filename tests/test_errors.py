@@ -1,4 +1,4 @@
-"""The error analysis: its numbers against independent ones, its files, and how it fails."""
+"""benchmarks/paper_errors.py, the error analysis: its numbers against independent ones, its files, and how it fails."""
 
 import csv
 import math
@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 import reference
 import torch
+from conftest import ROOT
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import cli
-from analytic_rasterizer.analysis import errors, tables
+from analytic_rasterizer.analysis import tables
+
+sys.path.append(str(ROOT / "benchmarks"))
+import paper_errors
+from paper import errors
 
 pytest.importorskip("tqdm", reason="needs the analysis extra")
 pytest.importorskip("matplotlib", reason="needs the analysis extra")
@@ -222,12 +226,12 @@ def test_plots_are_the_same_every_time(tmp_path):
         assert first.read_bytes() == second.read_bytes()
 
 
-def test_command_prints_the_summary(monkeypatch, tmp_path, capsys):
+def test_the_program_prints_the_summary(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(errors, "_figures", lambda results: {})  # those of `small`
     monkeypatch.setattr(errors, "all_cases", lambda: ["cumulant"])
     monkeypatch.setattr(errors, "ROTATION_SAMPLES", 2)
     out = tmp_path / "new"
-    assert cli.main(["errors", "--out", str(out), "--samples", "8", "--monte-carlo", "64"]) == 0
+    assert paper_errors.main(["--out", str(out), "--samples", "8", "--monte-carlo", "64"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith((out / "summary.md").read_text())
     assert "8 splats of each sigma" in printed
@@ -236,7 +240,7 @@ def test_command_prints_the_summary(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize("module", ["matplotlib.figure", "tqdm"])
 def test_missing_library_names_the_extra(monkeypatch, tmp_path, capsys, module):
     monkeypatch.setitem(sys.modules, module, None)
-    assert cli.main(["errors", "--out", str(tmp_path)]) == 2
+    assert paper_errors.main(["--out", str(tmp_path)]) == 2
     assert "pip install analytic_rasterizer[analysis]" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -251,7 +255,7 @@ def test_missing_library_names_the_extra(monkeypatch, tmp_path, capsys, module):
 )
 def test_wrong_arguments_are_one_line(args, message, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["errors", *args])
+        paper_errors.main([*args])
     assert stop.value.code == 2
     err = capsys.readouterr().err
     assert message in err

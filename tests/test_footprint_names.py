@@ -22,7 +22,6 @@ OTHERS = {
     "analytic_rasterizer/io/metadata.py": {"mip"},  # what Brush writes into files
     "analytic_rasterizer/training/options.py": {"box"},  # downsampling
     "analytic_rasterizer/training/pictures.py": {"box"},
-    "analytic_rasterizer/training/tables/protocols.py": {"analytic", "box", "moment"},  # rows of tables
 }
 
 

@@ -1,8 +1,11 @@
-"""The tables of the paper: its numbers, the protocols, and that a table is trained, tested, resumed and written."""
+"""benchmarks/paper_tables.py: the paper's numbers, the protocols, and that a table is trained, tested,
+resumed and written.
+"""
 
 import json
 import shutil
 import signal
+import sys
 from dataclasses import replace
 
 import pytest
@@ -14,22 +17,16 @@ pytest.importorskip("gsply", reason="needs the train extra")
 
 import torch  # noqa: E402
 from capture_files import circle, write_colmap, write_nerf_synthetic, write_pictures  # noqa: E402
+from conftest import ROOT, run_python  # noqa: E402
 
-from analytic_rasterizer import cli, io, training  # noqa: E402
+from analytic_rasterizer import io, training  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, captures, evaluate, files  # noqa: E402
 from analytic_rasterizer.training import model as g  # noqa: E402
-from analytic_rasterizer.training.tables import (  # noqa: E402
-    PUBLISHED,
-    ROWS,
-    TABLES,
-    Number,
-    Results,
-    as_dict,
-    markdown,
-    run_table,
-    text,
-)
-from analytic_rasterizer.training.tables.published import AVERAGE, FOUR_SCALES, parse  # noqa: E402
+
+sys.path.append(str(ROOT / "benchmarks"))
+import paper_tables  # noqa: E402
+from paper import PUBLISHED, ROWS, TABLES, Number, Results, as_dict, markdown, run_table, text  # noqa: E402
+from paper.published import AVERAGE, FOUR_SCALES, parse  # noqa: E402
 
 # ------------------------------------------------------------------------------- the paper's numbers
 
@@ -426,7 +423,7 @@ def test_a_broken_scene_is_found_before_any_is_trained(blender, tmp_path):
 def test_errors_are_one_line(blender, tmp_path, capsys, arguments, message):
     folders = ["--data", str(blender), "--out", str(tmp_path / "out"), "--no-lpips"] if len(arguments) > 1 else []
     try:
-        code = cli.main(["tables", *arguments, *folders])
+        code = paper_tables.main([*arguments, *folders])
     except SystemExit as stop:
         code = stop.code
     error = capsys.readouterr().err
@@ -439,22 +436,21 @@ def test_what_makes_a_row_cannot_be_changed(blender, tmp_path):
         run("blender-stst", blender, tmp_path, footprint="box")
 
 
-# ------------------------------------------------------------------------------------------- command
+# ------------------------------------------------------------------------------------------- program
 
 
-def test_the_command_lists_the_tables(capsys):
-    assert cli.main(["tables"]) == 0
-    printed = capsys.readouterr().out
+def test_the_program_lists_the_tables():
+    printed = run_python(ROOT / "benchmarks" / "paper_tables.py")
     assert all(f"{name} (" in printed for name in TABLES)
     assert "360-super-resolution (paper, Tab. 6)" in printed and "tests at 2 times the full size" in printed
     assert "full size 1/2: room, counter, kitchen, bonsai" in printed and "blender-stmt (ours only)" in printed
 
 
-def test_the_command_prints_the_table_and_measures_lpips_as_the_paper_did(blender, tmp_path, capsys, monkeypatch):
+def test_the_program_prints_the_table_and_measures_lpips_as_the_paper_did(blender, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     arguments = ["--data", str(blender), "--out", str(tmp_path / "out"), "--scenes", "lego", "--rows", "box"]
     arguments += ["--iterations", "1", "--preset", "quick", "--seed", "4", "--device", "cpu"]
-    assert cli.main(["tables", "blender-stst", *arguments]) == 0
+    assert paper_tables.main(["blender-stst", *arguments]) == 0
     captured = capsys.readouterr()
     assert "LPIPS is left out: " in captured.err and "vgg16-397923af.pth" in captured.err
     assert "[1/1] box, lego" in captured.err
@@ -470,8 +466,8 @@ def test_the_command_prints_the_table_and_measures_lpips_as_the_paper_did(blende
         asked.append((arguments, options))
         return lambda picture, truth: (picture - truth).abs().mean()
 
-    monkeypatch.setattr("analytic_rasterizer.cli.tables.load_lpips", load_lpips)
+    monkeypatch.setattr("paper_tables.load_lpips", load_lpips)
     monkeypatch.setattr(training.Trainer, "step", lambda trainer: pytest.fail("trains"))
-    assert cli.main(["tables", "blender-stst", *arguments]) == 0
+    assert paper_tables.main(["blender-stst", *arguments]) == 0
     assert asked == [(("vgg", "cpu"), {"like_3dgs": True})]
     assert "\nLPIPS\n" in capsys.readouterr().out

@@ -7,15 +7,20 @@ on stderr and exit code 2.
 
 from __future__ import annotations
 
+import argparse
+import sys
+
 from .. import _C, __version__
 from ..footprints import ADVICE_IN_WORDS
 from ..installation import about
-from . import bake, errors, evaluate, inspect, pareto, render, tables, train, view
+from . import bake, evaluate, inspect, pareto, render, train, view
 from .arguments import Parser, run_command
 
 __all__ = ["Parser", "build_parser", "main"]
 
-COMMANDS = (train, evaluate, tables, render, view, bake, inspect, errors, pareto)
+COMMANDS = (train, evaluate, render, view, bake, inspect, pareto)
+# Commands that are programs of the repository now.
+MOVED = {"tables": "benchmarks/paper_tables.py", "errors": "benchmarks/paper_errors.py"}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -24,7 +29,15 @@ def main(argv: list[str] | None = None) -> int:
     Args:
         argv: The words after the name of the program; None: those of the process.
     """
-    return run_command(lambda: build_parser().parse_args(argv))
+    words = sys.argv[1:] if argv is None else argv
+    return run_command(lambda: _parse(words))
+
+
+def _parse(words: list[str]) -> argparse.Namespace:
+    """The arguments; ValueError for a command that moved, whatever its options."""
+    if words and words[0] in MOVED:
+        raise ValueError(f"{words[0]} has moved: in a clone of the repository, run python {MOVED[words[0]]}")
+    return build_parser().parse_args(words)
 
 
 def build_parser() -> Parser:

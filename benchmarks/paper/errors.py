@@ -17,9 +17,16 @@ from pathlib import Path
 
 import torch
 
-from ..footprints import EXACT, PAPER_GRADIENT, TURNED, UNFILTERED, footprint_variants, footprint_weight
-from ..io import optional_import, write_text
-from . import tables
+from analytic_rasterizer.analysis import tables
+from analytic_rasterizer.footprints import (
+    EXACT,
+    PAPER_GRADIENT,
+    TURNED,
+    UNFILTERED,
+    footprint_variants,
+    footprint_weight,
+)
+from analytic_rasterizer.io import optional_import, write_text
 
 PAPER_SIGMAS = (0.3, 6.6)  # px, the range of [AS, Sec. 2.4]
 SIGMAS = (0.02, 20.0)  # px, ours

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from statistics import mean
 from typing import Any
 
-from ...analysis.tables import format_table, markdown_table
-from ..evaluation import MEASURES
+from analytic_rasterizer.analysis.tables import format_table, markdown_table
+from analytic_rasterizer.training.evaluation import MEASURES
+
 from .protocols import Table
 from .published import AVERAGE, FOUR_SCALES, PUBLISHED, Number, Published
 

@@ -14,15 +14,16 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ... import io
-from ...analysis.timing import describe_machine
-from ..captures import load_capture
-from ..evaluation import Perceptual, evaluate
-from ..files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_text
-from ..options import TrainingOptions, preset_values
-from ..pictures import load_pictures
-from ..run import Run
-from ..start import background_of
+from analytic_rasterizer import io
+from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.training.captures import load_capture
+from analytic_rasterizer.training.evaluation import Perceptual, evaluate
+from analytic_rasterizer.training.files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_text
+from analytic_rasterizer.training.options import TrainingOptions, preset_values
+from analytic_rasterizer.training.pictures import load_pictures
+from analytic_rasterizer.training.run import Run
+from analytic_rasterizer.training.start import background_of
+
 from .protocols import Row, Table
 from .report import Results, as_dict, markdown
 
