@@ -23,10 +23,10 @@ try:
 except ImportError as error:
     raise ImportError(why_not_loaded(error)) from error
 
-from . import activations, density, losses, optim
+from . import _old_names, activations, density, losses, optim
 from .analysis.planner import SceneReport, inspect_scene, plan
-from .camera import View, camera_settings, moved
-from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
+from .cameras.camera import View, camera_settings, moved
+from .cameras.lens import Lens
 from .filters import apply_3d_filter, bake_dilation, bake_pixel, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
@@ -37,13 +37,13 @@ from .footprints import (
     set_default_footprint,
 )
 from .gaussians import Gaussians
-from .lens import Lens
-from .outputs import normalized
-from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
-from .settings import GaussianRasterizationSettings
+from .render.effects import Defocus, Effects, GaussianStats, Motion, Outputs
+from .render.outputs import normalized
+from .render.rasterizer import GaussianRasterizer, rasterize_gaussians
+from .render.settings import GaussianRasterizationSettings
+from .render.stages import Splats, Stages, TileLists, blend, list_tiles, project, render_stages
 from .sh import needed_sh_degree
-from .stages import Splats, Stages, TileLists, blend, list_tiles, project, render_stages
 
 __version__ = "0.2.0"
 
@@ -92,5 +92,6 @@ __all__ = [
     "set_default_footprint",
 ]
 
+_old_names.keep(__name__)
 warn_if_built_for_another(BUILT_FOR)
 warn_if_replaced()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import torch
-
-from .settings import whole_number
 
 
 def check_tensors(device: torch.device | None, **tensors: Any) -> None:
@@ -17,6 +17,60 @@ def check_tensors(device: torch.device | None, **tensors: Any) -> None:
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
         if device is not None and tensor.device != device:
             raise ValueError(f"{name} must be on the device of means3D, {device}, got {tensor.device}")
+
+
+def check_number(name: str, value, at_least: float = -math.inf, above: float = -math.inf) -> None:
+    """Raises TypeError or ValueError unless the value is a finite number within the bounds, or a tensor with one."""
+    if isinstance(value, torch.Tensor):
+        if value.numel() != 1:
+            raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
+        return  # the value is not examined: on a device that would have to be waited for
+    if isinstance(value, bool) or not isinstance(value, Real):  # numpy's are Real too
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    if not (_is_finite(value) and value >= at_least and value > above):
+        limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
+        raise ValueError(f"{name} must be finite{limit}, got {value}")
+
+
+def whole_number(name: str, value: Any) -> int:
+    """The whole number that `value` is: an int, or what programs have in its place, such as 24.0 or a tensor of one.
+
+    Raises:
+        TypeError: It is not one number.
+        ValueError: It is not whole.
+    """
+    if type(value) is int:
+        return value
+
+    def wrong(error: type[Exception]) -> Exception:  # made where it is raised: a tensor's text waits for its device
+        return error(f"{name} must be a whole number, got {value!r}")
+
+    if isinstance(value, (str, bytes, bool)):
+        raise wrong(TypeError)
+    try:
+        number = int(value)
+    except (TypeError, RuntimeError):  # of tensors with several numbers, with some versions of torch
+        raise wrong(TypeError) from None
+    except (ValueError, OverflowError):  # of NaN and infinity
+        raise wrong(ValueError) from None
+    if number != value:
+        raise wrong(ValueError)
+    return number
+
+
+def one_number(name: str, value: Any) -> float:
+    """The number that `value` is: a float, or what programs have in its place, such as a tensor of one.
+
+    Raises:
+        TypeError: It is not one number.
+        ValueError: It is larger than any float.
+    """
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(f"{name} must be a number that a float can hold, got a larger one") from None
+    except (TypeError, ValueError, RuntimeError):  # which of them depends on the type and on the version of torch
+        raise TypeError(f"{name} must be a number, got {value!r}") from None
 
 
 def plain_value(name: str, value: Any, kind: type) -> Any:
@@ -50,3 +104,10 @@ def check_value(name: str, fits: bool, expected: str, got: Any) -> None:
     """Raises ValueError, naming an option, unless its value fits."""
     if not fits:
         raise ValueError(f"{name} must be {expected}, got {got}")
+
+
+def _is_finite(value: Real) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer of hundreds of digits, as JSON may have
+        return False

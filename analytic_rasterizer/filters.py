@@ -15,15 +15,15 @@ from typing import Any
 import torch
 
 from . import ops  # noqa: F401  (registers the fake kernels)
-from .autocast import way_out_of, widened
-from .camera import view_center
+from .cameras.camera import view_center
+from .cameras.rotations import rotation_matrices
 from .checks import check_tensors
-from .effects import Effects
 from .footprints import DILATED, check_device, resolve_footprint
-from .outputs import depths
-from .rotations import rotation_matrices
-from .seam import has_seam
-from .settings import GaussianRasterizationSettings
+from .render.autocast import way_out_of, widened
+from .render.effects import Effects
+from .render.outputs import depths
+from .render.seam import has_seam
+from .render.settings import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 PIXEL_VARIANCE = 1 / 12  # of the square pixel along an axis, in squares of its width

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from . import _C  # loads the ops
-from .autocast import widened
+from .render.autocast import widened
 
 _VARIANTS: dict[str, list[dict[str, Any]]] = {}  # what the headers say, by public name, in the order of the registry
 for _variant in _C.footprints():

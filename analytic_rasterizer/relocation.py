@@ -10,7 +10,7 @@ import math
 
 import torch
 
-from .settings import whole_number
+from .checks import whole_number
 
 _MOST = 1000  # whose binomials fit a float64
 

@@ -7,9 +7,8 @@ import math
 import torch
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from .checks import check_tensors
-from .effects import AUTO, MAX_SH_DEGREE, Effects
-from .settings import one_number
+from .checks import check_tensors, one_number
+from .render.effects import AUTO, MAX_SH_DEGREE, Effects
 
 
 @torch.no_grad()

@@ -35,9 +35,9 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, supersampled
 from analytic_rasterizer.analysis.tables import markdown_table
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.cli.arguments import add_scales, whole_reductions
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.rotations import rotation_matrices
 
 ALPHA_MAX, TRANSMITTANCE_MIN = 0.99, 1e-4
 FAINTEST = 1e-5  # alphas below this are left out everywhere

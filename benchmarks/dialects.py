@@ -23,7 +23,7 @@ import torch
 import analytic_rasterizer as ar
 from analytic_rasterizer import dialects
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.rasterizer import NOTHING, render
+from analytic_rasterizer.render.rasterizer import NOTHING, render
 
 GAUSSIANS, SIZE, DEGREE = 10, 32, 1
 PERCENTILE = 10

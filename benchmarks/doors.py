@@ -46,8 +46,8 @@ from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import WARM_UP, Case, fixed_weights, seconds_of
 from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.dialects import gsplat
-from analytic_rasterizer.effects import NEAR
 from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.render.effects import NEAR
 
 PASSES = ("forward", "forward_backward")
 TINY_ROUNDS = 500

@@ -30,10 +30,10 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import Case, fixed_weights
-from analytic_rasterizer.camera import view_center
+from analytic_rasterizer.cameras.camera import view_center
 from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.outputs import depths
+from analytic_rasterizer.render.outputs import depths
 
 FOOTPRINTS = ["box:samples=1", "box:samples=4"]
 DISC, STREAK = 2.0, 4.0  # px

@@ -41,10 +41,10 @@ from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.affine import LIMIT, PIXEL_VARIANCE, affine_error
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors
 from analytic_rasterizer.analysis.tables import markdown_table
-from analytic_rasterizer.effects import NEAR
+from analytic_rasterizer.cameras.lens import WIDE, Lens
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
-from analytic_rasterizer.lens import WIDE, Lens
-from analytic_rasterizer.rotations import rotation_matrices
+from analytic_rasterizer.render.effects import NEAR
 from analytic_rasterizer.training.undistortion import window_of, without_lens
 
 SIZE = 128, 96

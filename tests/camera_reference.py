@@ -6,7 +6,7 @@ from functools import lru_cache
 import torch
 
 from analytic_rasterizer import _C
-from analytic_rasterizer.lens import WIDE
+from analytic_rasterizer.cameras.lens import WIDE
 
 DIRECTIONS, ANGLES = 64, 512
 

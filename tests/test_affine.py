@@ -8,8 +8,8 @@ import torch
 import analytic_rasterizer as ar
 from analytic_rasterizer.analysis import affine
 from analytic_rasterizer.analysis.affine import affine_error
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.rotations import rotation_matrices
 
 
 def gaussians(means, scales, seed=0):

@@ -11,7 +11,7 @@ from torch._subclasses import FakeTensorMode
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
-from analytic_rasterizer.arguments import camera_arguments, gaussian_arguments
+from analytic_rasterizer.render.arguments import camera_arguments, gaussian_arguments
 
 CAMERA = scenes.Camera()
 

@@ -9,9 +9,9 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
-from analytic_rasterizer.camera_path import focus, level_up, looking_at, orbit, position, quaternion, through
+from analytic_rasterizer.cameras.path import focus, level_up, looking_at, orbit, position, quaternion, through
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.rotations import rotation_matrices
 
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 

@@ -7,10 +7,10 @@ import torch
 from conftest import needs_cuda
 
 from analytic_rasterizer import density, io
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.density import gradient, monte_carlo
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
-from analytic_rasterizer.rotations import rotation_matrices
 from analytic_rasterizer.training import TrainingOptions, trainer
 from analytic_rasterizer.training import model as g
 

@@ -10,7 +10,7 @@ from scenes import Camera, ParallelCamera
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import filters
-from analytic_rasterizer.rotations import rotation_matrices
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 
 F64 = torch.float64
 

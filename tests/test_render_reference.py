@@ -17,7 +17,7 @@ import torch
 from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
-from analytic_rasterizer.arguments import camera_arguments, gaussian_arguments
+from analytic_rasterizer.render.arguments import camera_arguments, gaussian_arguments
 
 IMAGE_TOLERANCE = {torch.float64: 1e-10, torch.float32: 4e-5}
 GRADIENT_TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}  # of the largest entry

@@ -19,10 +19,10 @@ from processes import DEADLINE
 from training_step import TOLERANCE, check_next_step
 
 from analytic_rasterizer import cli, io, optim
+from analytic_rasterizer.cameras.lens import Lens
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.lens import Lens
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 pytest.importorskip("tqdm", reason="needs the train extra")
@@ -37,8 +37,8 @@ from capture_files import (  # noqa: E402
 )
 
 from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.arguments import camera_arguments  # noqa: E402
 from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
+from analytic_rasterizer.render.arguments import camera_arguments  # noqa: E402
 from analytic_rasterizer.training import (  # noqa: E402
     TrainingOptions,
     captures,

@@ -15,8 +15,8 @@ import torch
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in
 from analytic_rasterizer import dialects, io
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.gaussians import SH_C0
-from analytic_rasterizer.rotations import rotation_matrices
 
 pytestmark = pytest.mark.usefixtures("nothing_chosen")
 

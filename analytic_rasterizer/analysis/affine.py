@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import torch
 
-from ..camera import is_orthographic
-from ..effects import NEAR, Effects
+from ..cameras.camera import is_orthographic
+from ..cameras.lens import Lens
+from ..cameras.rotations import product, rotation_matrices
 from ..filters import PIXEL_VARIANCE
 from ..gaussians import Gaussians
-from ..lens import Lens
-from ..rotations import product, rotation_matrices
-from ..settings import GaussianRasterizationSettings
+from ..render.effects import NEAR, Effects
+from ..render.settings import GaussianRasterizationSettings
 
 LIMIT = 0.3  # of `affine_error`: there a weight is off by 0.1 to 0.3 at most
 _ROWS = 2**18  # that are computed at a time

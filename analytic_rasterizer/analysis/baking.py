@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import torch
 
-from ..camera import View
+from ..cameras.camera import View
 from ..filters import bake_dilation
 from ..footprints import RECOMMENDED, Footprint
 from ..gaussians import Gaussians
-from ..rasterizer import GaussianRasterizer
+from ..render.rasterizer import GaussianRasterizer
 from . import tables
 
 REDUCTIONS = (1, 2, 4, 8)

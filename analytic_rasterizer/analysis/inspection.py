@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from ..effects import Effects
 from ..footprints import ADVICE_IN_WORDS
 from ..io import write_safely
+from ..render.effects import Effects
 from . import tables
 
 NARROW = 0.5  # px

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ..camera import View
+from ..cameras.camera import View
 
 BYTES_PER_PIXEL = 64  # of a picture that is rendered without gradients and written: measured, rounded up
 LARGEST_SIDE = 2**20  # px, as in files of views

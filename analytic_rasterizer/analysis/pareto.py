@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from ..camera import View
+from ..cameras.camera import View
 from ..footprints import (
     DILATED,
     EXACT,

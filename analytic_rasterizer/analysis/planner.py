@@ -16,16 +16,16 @@ from functools import partial, reduce
 import torch
 
 from .._C import FRUSTUM_CLAMP
-from ..camera import View, is_off_center, is_orthographic
-from ..effects import NEAR, Effects
+from ..cameras.camera import View, is_off_center, is_orthographic
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from ..footprints import sampled_footprints
 from ..gaussians import Gaussians
-from ..outputs import depths
-from ..rasterizer import GaussianRasterizer
-from ..settings import GaussianRasterizationSettings
+from ..render.effects import NEAR, Effects
+from ..render.outputs import depths
+from ..render.rasterizer import GaussianRasterizer
+from ..render.settings import GaussianRasterizationSettings
+from ..render.stages import Splats, Stages, project, render_stages
 from ..sh import needed_sh_degree, sh_band_bounds
-from ..stages import Splats, Stages, project, render_stages
 from . import timing
 from .affine import LIMIT, affine_error
 from .inspection import BINS, NARROW, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share

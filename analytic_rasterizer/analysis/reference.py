@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ..camera import View
+from ..cameras.camera import View
 from ..footprints import UNFILTERED, resolve_footprint
 from ..gaussians import Gaussians
 from ..io import optional_import
-from ..rasterizer import GaussianRasterizer
+from ..render.rasterizer import GaussianRasterizer
 
 RMSE_SHARE = 0.1  # a reference is refined until it changes by at most this share of the smallest error
 MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is not refined

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 
 from .. import _C
-from ..camera import View
+from ..cameras.camera import View
 from ..gaussians import Gaussians
-from ..rasterizer import GaussianRasterizer
+from ..render.rasterizer import GaussianRasterizer
 
 ROUNDS = {"cpu": 5, "cuda": 20}
 SLOW = 20  # calls that take so many times as long as the base are timed only twice on the CPU

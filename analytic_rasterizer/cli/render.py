@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .. import camera_path, io, render_stages
+from .. import io, render_stages
 from ..analysis import tables
 from ..analysis.memory import check_sizes
-from ..effects import Effects
+from ..cameras import path as camera_path
 from ..footprints import FOOTPRINTS, Footprint, resolve_footprint
 from ..gaussians import Gaussians
-from ..outputs import normalized
-from ..rasterizer import GaussianRasterizer
+from ..render.effects import Effects
+from ..render.outputs import normalized
+from ..render.rasterizer import GaussianRasterizer
 from ..viewer.packing import extent
 from .arguments import (
     LARGER,

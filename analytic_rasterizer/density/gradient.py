@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from .. import ops  # noqa: F401  (registers the fake kernels)
+from ..cameras.rotations import rotation_matrices
 from ..checks import check_value, plain_value
 from ..gaussians import Gaussians
 from ..optim import clear_moments
-from ..rotations import rotation_matrices
 from .control import FixedDensity, normal_numbers, passes
 from .options import GradientOptions, options_of
 

@@ -11,12 +11,12 @@ import torch
 
 from .. import _C
 from ..checks import check_tensors
-from ..effects import Effects, Outputs
 from ..footprints import PAPER, Footprint, chosen_footprint, resolve_footprint
-from ..rasterizer import NOTHING, render
-from ..rasterizer import GaussianRasterizer as LibraryRasterizer
-from ..settings import GaussianRasterizationSettings as LibrarySettings
-from ..stages import project
+from ..render.effects import Effects, Outputs
+from ..render.rasterizer import NOTHING, render
+from ..render.rasterizer import GaussianRasterizer as LibraryRasterizer
+from ..render.settings import GaussianRasterizationSettings as LibrarySettings
+from ..render.stages import project
 from ._refused import refusal, refuse
 
 FIELDS = LibrarySettings._fields

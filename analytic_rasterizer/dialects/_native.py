@@ -13,11 +13,11 @@ import math
 import torch
 
 from .. import _C
-from ..arguments import camera_arguments, gaussian_arguments
 from ..checks import check_tensors
 from ..losses import ssim
-from ..rasterizer import GaussianRasterizer
-from ..settings import GaussianRasterizationSettings
+from ..render.arguments import camera_arguments, gaussian_arguments
+from ..render.rasterizer import GaussianRasterizer
+from ..render.settings import GaussianRasterizationSettings
 
 _TILE_OFFSETS, _COUNTS = map(_C.LISTS.index, ("tile_offsets", "counts"))  # in what the op saves
 

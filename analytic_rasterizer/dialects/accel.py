@@ -6,9 +6,9 @@ whether the module has a SparseGaussianAdam, and call with `dc` if it has: it is
 
 import torch
 
-from ..autocast import way_out_of, widened
 from ..checks import check_tensors
 from ..optim import SparseGaussianAdam
+from ..render.autocast import way_out_of, widened
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import forward_like, given, render_by
 from .gs2024 import GaussianRasterizationSettings as Settings

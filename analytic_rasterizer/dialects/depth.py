@@ -6,8 +6,8 @@ blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect 
 """
 
 from ..checks import check_tensors
-from ..effects import Effects
 from ..footprints import DILATED
+from ..render.effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import forward_like, given, rasterize_gaussians

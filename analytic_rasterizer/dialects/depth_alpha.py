@@ -4,7 +4,7 @@ Repositories: dreamgaussian/dreamgaussian, LGM, SC-GS and others with ashawkey's
 colour on zero. Its settings are those of 3DGS 2023, so this dialect has to be chosen.
 """
 
-from ..effects import Effects
+from ..render.effects import Effects
 from ._base import GaussianRasterizer, rasterize_gaussians
 from .depth import GaussianRasterizationSettings as Settings
 

@@ -3,8 +3,8 @@
 Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a feature of each Gaussian.
 """
 
-from ..effects import Effects
 from ..footprints import DILATED
+from ..render.effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import feature_rows, forward_like, render_by, with_channels

@@ -5,8 +5,8 @@ Deviates: `antialiasing` asks for a filter of one pixel, which integrating over 
 unless the user chose the footprint `point`, which becomes `mip` with the same variance.
 """
 
-from ..effects import Effects
 from ..footprints import COMPENSATED, DILATED, Footprint
+from ..render.effects import Effects
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 

@@ -4,9 +4,9 @@ Repositories: VITA-Group/LightGaussian. A count is the number of pixels in which
 Deviates: a score is the sum of the Gaussian's weights in those pixels, which falls off towards the Gaussian's edge.
 """
 
-from ..effects import Effects
 from ..footprints import DILATED
-from ..rasterizer import NOTHING
+from ..render.effects import Effects
+from ..render.rasterizer import NOTHING
 from ._base import FIELDS, GaussianRasterizer, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 

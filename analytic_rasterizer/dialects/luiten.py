@@ -6,8 +6,8 @@ pixel's light is left; it has no gradient, and is 15 where more gets through.
 
 import torch
 
-from ..effects import Effects
 from ..footprints import DILATED
+from ..render.effects import Effects
 from ._base import FIELDS, GaussianRasterizer, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import torch
 
-from ..autocast import widened, widened_settings
-from ..effects import Effects
+from ..cameras.rotations import rotation_matrices
 from ..footprints import DILATED
-from ..outputs import depths
-from ..rasterizer import render
-from ..rotations import rotation_matrices
+from ..render.autocast import widened, widened_settings
+from ..render.effects import Effects
+from ..render.outputs import depths
+from ..render.rasterizer import render
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import as_settings, given, rasterize_gaussians

@@ -10,9 +10,9 @@ import weakref
 
 import torch
 
-from ..autocast import widened
 from ..checks import check_tensors
 from ..footprints import COMPENSATED, Footprint
+from ..render.autocast import widened
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 from ._later import LaterFlags

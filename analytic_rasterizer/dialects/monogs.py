@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import torch
 
-from ..autocast import widened
+from ..cameras.rotations import product
 from ..checks import check_tensors
-from ..effects import Effects
 from ..footprints import DILATED
-from ..rotations import product
+from ..render.autocast import widened
+from ..render.effects import Effects
 from ._base import FIELDS, forward_like, render_by
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer

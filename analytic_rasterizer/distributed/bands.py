@@ -11,10 +11,10 @@ import torch
 import torch.distributed as dist
 
 from .._C import tile_size
-from ..arguments import camera_arguments
-from ..autocast import widened, widened_settings
-from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, blend, list_tiles, project
+from ..render.arguments import camera_arguments
+from ..render.autocast import widened, widened_settings
+from ..render.settings import GaussianRasterizationSettings
+from ..render.stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in
 from .cameras import check_camera, check_colors, summary_of
 from .exchange import DIFFERENTIABLE, Route, exchange

@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 import torch
 import torch.distributed as dist
 
-from ..autocast import way_out_of, widened, widened_settings
 from ..checks import check_tensors
-from ..effects import AUTO
-from ..seam import has_seam
-from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, blend, list_tiles, project
+from ..render.autocast import way_out_of, widened, widened_settings
+from ..render.effects import AUTO
+from ..render.seam import has_seam
+from ..render.settings import GaussianRasterizationSettings
+from ..render.stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
 from .exchange import Route
 from .rows import OwnSplats, Shard, Step, agreeing, rendered, together

@@ -11,7 +11,7 @@ import torch
 import torch.distributed as dist
 from torch.autograd.function import once_differentiable
 
-from ..stages import Splats
+from ..render.stages import Splats
 
 DIFFERENTIABLE = ("means2d", "cov2d", "opacities", "depths", "colors")  # what is sent of a splat
 ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among

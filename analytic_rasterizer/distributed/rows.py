@@ -17,8 +17,8 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from .. import _C
-from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, project_arguments
+from ..render.settings import GaussianRasterizationSettings
+from ..render.stages import Splats, project_arguments
 from .exchange import ID_OF, Route
 
 _OPS = torch.ops.analytic_rasterizer

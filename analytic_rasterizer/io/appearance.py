@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..camera import View
+from ..cameras.camera import View
 from ..filters import PIXEL_VARIANCE
 from ..footprints import (
     COMPENSATED,

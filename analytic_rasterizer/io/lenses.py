@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ..lens import Lens
+from ..cameras.lens import Lens
 from .common import SceneError
 
 SIMPLE_PINHOLE, PINHOLE, FULL_OPENCV = "SIMPLE_PINHOLE", "PINHOLE", "FULL_OPENCV"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ..camera import View
+from ..cameras.camera import View
 
 CFG_ARGS = "cfg_args"
 LARGEST = 1 << 16  # bytes of cfg_args; that of 3DGS has a few hundred

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ..camera import View
+from ..cameras.camera import View
 from .common import SceneError, first_line, opened_picture
 from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, sphere_of
 from .pictures import PictureFiles

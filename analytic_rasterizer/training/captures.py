@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from .. import io
-from ..effects import NEAR
+from ..render.effects import NEAR
 from . import colmap
 from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance
 from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, has_splits, read_layout

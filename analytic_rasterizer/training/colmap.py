@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..cameras.rotations import rotation_matrices
 from ..io.lenses import lens_of_colmap
 from ..io.views import with_distinct_names
-from ..rotations import rotation_matrices
 
 
 class Model(NamedTuple):

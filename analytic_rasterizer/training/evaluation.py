@@ -15,7 +15,7 @@ from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
 from ..losses import counted, ssim
-from ..settings import GaussianRasterizationSettings
+from ..render.settings import GaussianRasterizationSettings
 from .exposure import best_exposure, corrected
 from .model import render, render_together
 from .pictures import Pictures

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..camera import View
+from ..cameras.camera import View
 
 RADIUS_FACTOR = 1.1  # [3DGS]
 SEEN_SHARE = 0.5  # of the distance of what cameras see: the least extent

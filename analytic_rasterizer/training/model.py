@@ -13,8 +13,8 @@ from .. import distributed
 from ..filters import apply_3d_filter
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from ..rasterizer import rasterize_gaussians
-from ..settings import GaussianRasterizationSettings
+from ..render.rasterizer import rasterize_gaussians
+from ..render.settings import GaussianRasterizationSettings
 from .exposure import corrected
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from .. import io
 from ..io.common import naming
-from ..settings import GaussianRasterizationSettings
+from ..render.settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .options import check_scales
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size

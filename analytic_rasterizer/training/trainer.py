@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from .. import _C
-from ..arguments import camera_arguments
 from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
 from ..losses import counted
-from ..seam import has_seam
-from ..settings import GaussianRasterizationSettings
+from ..render.arguments import camera_arguments
+from ..render.seam import has_seam
+from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .exposure import Exposures
 from .extent import extent_of

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
-from ..lens import Lens
+from ..cameras.lens import Lens
 
 MOST_GROWTH = 2.0  # of width and height, where a lens sees more than its pinhole
 # How far neighbouring pixels of the pinhole may be apart in the photograph, beside those in the middle. Where it is

@@ -15,7 +15,7 @@ import torch
 from .. import io
 from ..footprints import footprint_variants
 from ..gaussians import Gaussians
-from ..rasterizer import GaussianRasterizer
+from ..render.rasterizer import GaussianRasterizer
 
 MOVING_SECONDS = 0.06
 """What a frame should take while its camera moves; the resolution adapts to it."""

@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 from ..._C import MAX_CHANNELS
-from ...autocast import way_out_of
-from ...effects import MAX_SH_DEGREE
+from ...checks import one_number, whole_number
 from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, resolve_footprint
-from ...settings import one_number, whole_number
+from ...render.autocast import way_out_of
+from ...render.effects import MAX_SH_DEGREE
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED", "d", "Ed", "RGB-d", "RGB-Ed")
 """What `rasterization` renders: colours, accumulated or expected depth, distance along the ray, or both kinds."""

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from ...lens import SIZE
+from ...cameras.lens import SIZE
 from ...ops import Op
 from .arguments import LENS
 

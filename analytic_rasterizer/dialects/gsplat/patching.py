@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from ... import relocation
-from ...rotations import product, rotation_matrices
+from ...cameras.rotations import product, rotation_matrices
 from .rendering import rasterization, upper_triangle
 
 _TORCH_FLAG = "_force_torch_backend"  # of gsplat.strategy.ops: whether noise is added without gsplat's CUDA code

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from ...distributed.agreement import REQUIREMENTS, agree, facts_of, gather, place_in
 from ...distributed.cameras import summary_of
 from ...distributed.exchange import Route, exchange
-from ...stages import ROWS, Splats
+from ...render.stages import ROWS, Splats
 from .arguments import CAMERAS, LENS, TENSORS, Call, Sizes, checked
 from .scene import Scene
 

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from ..._C import TILE
-from ...autocast import widened
 from ...footprints import Footprint
+from ...render.autocast import widened
 from .arguments import RASTERIZE_MODES, RENDER_MODES, TENSORS, Call, checked
 from .cameras import flat_cameras, prepared_cameras
 from .ranks import Sharing

@@ -11,9 +11,9 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from ...cameras.rotations import rotation_matrices
 from ...footprints import COMPENSATED, DILATED, Footprint
 from ...ops import Op
-from ...rotations import rotation_matrices
 from .arguments import Mode, Signal, Sizes
 
 _AT_ONCE = 3  # channels of harmonics that `project` evaluates

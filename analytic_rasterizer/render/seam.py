@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from . import _C
+from .. import _C
+from ..cameras.lens import SPHERE
+from ..checks import one_number, whole_number
 from .effects import Effects
-from .lens import SPHERE
-from .settings import one_number, whole_number
 
 # Standard deviations along a row of pixels, in turns. Wider splats are narrowed to the first: their copies together
 # vary by 2% at most around the turn. Narrower than the second, copies do not overlap: exp(-32) is rounding.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from . import _C
-from .scalars import check_number
+from .. import _C
+from ..checks import check_number
 
 SIZE = dict(_C.LENS)["distortion"]
 # By model: how many coefficients there are at most, radial, tangential and thin prism ones, and where each kind begins.

@@ -7,16 +7,16 @@ from typing import Any
 
 import torch
 
-from . import _C
+from .. import _C
+from ..checks import check_tensors, one_number, whole_number
+from ..filters import apply_3d_filter
+from ..footprints import check_device
+from ..ops import Op
+from ..sh import used_sh_degree
 from .autocast import widened
-from .checks import check_tensors
 from .effects import MAX_SH_DEGREE, Effects
-from .filters import apply_3d_filter
-from .footprints import check_device
-from .ops import Op
 from .seam import has_seam
-from .settings import GaussianRasterizationSettings, check_settings, one_number, whole_number
-from .sh import used_sh_degree
+from .settings import GaussianRasterizationSettings, check_settings
 
 _NOTHING = Effects()
 _prepare_lens = Op("prepare_lens")

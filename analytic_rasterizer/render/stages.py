@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import _C
+from .. import _C
+from ..checks import check_tensors
+from ..ops import Op
 from .arguments import camera_arguments, gaussian_arguments
-from .checks import check_tensors
 from .effects import Effects
-from .ops import Op
 from .outputs import before_background, depths, split_background
 from .seam import turns_of, with_copies
 from .settings import GaussianRasterizationSettings, check_settings

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import _C
-from .lens import Lens
-from .scalars import check_number
+from .. import _C
+from ..cameras.lens import Lens
+from ..checks import check_number
 
 MAX_SH_DEGREE = _C.MAX_SH_DEGREE
 NEAR = _C.NEAR  # camera-space z up to which everything is culled

@@ -8,13 +8,14 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from . import _C, advice
+from .. import _C
+from ..checks import check_tensors, whole_number
+from . import advice
 from .autocast import way_out_of, widened
-from .checks import check_tensors
 from .effects import Effects, Outputs
 from .outputs import before_background, named_summary, split_background
 from .seam import with_copies
-from .settings import check_settings, whole_number
+from .settings import check_settings
 from .stages import blend, list_tiles, project_once
 
 

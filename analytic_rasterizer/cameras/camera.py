@@ -8,14 +8,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from . import _C
-from .autocast import widened
-from .checks import check_tensors
-from .effects import AUTO, NEAR, Effects
+from .. import _C
+from ..checks import check_tensors, one_number, whole_number
+from ..ops import Op
+from ..render.autocast import widened
+from ..render.effects import AUTO, NEAR, Effects
+from ..render.settings import GaussianRasterizationSettings
 from .lens import Lens
-from .ops import Op
 from .rotations import product
-from .settings import GaussianRasterizationSettings, one_number, whole_number
 
 _prepare = Op("prepare_cameras")
 

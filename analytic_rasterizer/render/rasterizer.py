@@ -10,12 +10,13 @@ from typing import Any
 
 import torch
 
-from . import _C, advice
+from .. import _C
+from ..checks import check_tensors
+from ..ops import Op
+from . import advice
 from .arguments import camera_arguments, gaussian_arguments
 from .autocast import way_out_of, widened
-from .checks import check_tensors
 from .effects import NEAR, Effects, Outputs
-from .ops import Op
 from .outputs import before_background, depths, named_summary, split_background
 from .seam import has_seam
 from .settings import GaussianRasterizationSettings

@@ -8,11 +8,12 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+from pathlib import Path
 
 import torch
 
-from . import _C
-from .footprints import DILATED, ENVIRONMENT_VARIABLE, PAPER, RECOMMENDED, chosen_footprint
+from .. import _C
+from ..footprints import DILATED, ENVIRONMENT_VARIABLE, PAPER, RECOMMENDED, chosen_footprint
 from .settings import GaussianRasterizationSettings
 
 TEXT = (
@@ -43,7 +44,7 @@ def give(settings: GaussianRasterizationSettings) -> None:
 
 def _level_of_program() -> int:
     """Of the frame that warnings.warn names: the first one outside of this package, its namesakes and torch."""
-    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    root = Path(os.path.abspath(__file__)).parents[2]
     names = "analytic_rasterizer", "diff_gaussian_rasterization", "diff_gaussian_rasterization_ms"
     ours = tuple(os.path.join(root, name, "") for name in names)
     ours += (os.path.join(os.path.dirname(os.path.abspath(torch.__file__)), ""),)

@@ -7,49 +7,8 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..footprints import Footprint, chosen_footprint, get_default_footprint, resolve_footprint
 from .effects import AUTO, Effects
-from .footprints import Footprint, chosen_footprint, get_default_footprint, resolve_footprint
-
-
-def whole_number(name: str, value: Any) -> int:
-    """The whole number that `value` is: an int, or what programs have in its place, such as 24.0 or a tensor of one.
-
-    Raises:
-        TypeError: It is not one number.
-        ValueError: It is not whole.
-    """
-    if type(value) is int:
-        return value
-
-    def wrong(error: type[Exception]) -> Exception:  # made where it is raised: a tensor's text waits for its device
-        return error(f"{name} must be a whole number, got {value!r}")
-
-    if isinstance(value, (str, bytes, bool)):
-        raise wrong(TypeError)
-    try:
-        number = int(value)
-    except (TypeError, RuntimeError):  # of tensors with several numbers, with some versions of torch
-        raise wrong(TypeError) from None
-    except (ValueError, OverflowError):  # of NaN and infinity
-        raise wrong(ValueError) from None
-    if number != value:
-        raise wrong(ValueError)
-    return number
-
-
-def one_number(name: str, value: Any) -> float:
-    """The number that `value` is: a float, or what programs have in its place, such as a tensor of one.
-
-    Raises:
-        TypeError: It is not one number.
-        ValueError: It is larger than any float.
-    """
-    try:
-        return float(value)
-    except OverflowError:
-        raise ValueError(f"{name} must be a number that a float can hold, got a larger one") from None
-    except (TypeError, ValueError, RuntimeError):  # which of them depends on the type and on the version of torch
-        raise TypeError(f"{name} must be a number, got {value!r}") from None
 
 
 class _Fields(NamedTuple):

@@ -1,0 +1,9 @@
+"""Cameras: where pictures are taken from, and with which lens.
+
+| module | contains |
+|---|---|
+| `camera` | `View`, and settings from a pose and focal lengths |
+| `lens` | `Lens`: cameras that are no pinhole |
+| `rotations` | rotations and small matrices |
+| `path` | camera paths for films |
+"""
