@@ -20,6 +20,7 @@ from capture_files import looking_at_origin, quaternion, write_colmap_text  # no
 
 from analytic_rasterizer.training import automatic, colmap, evidence, plan  # noqa: E402
 from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
+from analytic_rasterizer.training.options import as_words  # noqa: E402
 from analytic_rasterizer.training.photographs import Stored  # noqa: E402
 from analytic_rasterizer.training.plan import (  # noqa: E402
     EXPOSURE,
@@ -210,6 +211,7 @@ def test_sampling_intervals_and_scales(tmp_path):
     assert found["sampling"].verdict == YES and found["scales"].verdict == NO
     found = plan_of(write_wall(tmp_path / "many", cameras(lambda i: 1 + 5 * (i % 2))))
     assert found["scales"].verdict == YES and found["scales"].option == "--scales 1,2,4,8"
+    assert found["scales"].options == {"scales": (1, 2, 4, 8)}
 
 
 def test_no_points(tmp_path):
@@ -259,8 +261,11 @@ def test_pictures_of_several_sizes(tmp_path):
             for key, value in zip(rows, (name, c2w.tolist(), 64 // scale, 64 // scale, 70 / scale)):
                 rows[key].append(value)
     (tmp_path / "metadata.json").write_text(json.dumps({"train": rows, "test": {key: [] for key in rows}}))
-    found = plan_of(tmp_path)
+    whole = plan_capture(tmp_path)
+    found = findings(whole)
     assert (found["scales"].verdict, found["scales"].number) == (YES, 3)
+    assert whole.options == found["scales"].options == {"scales": (1, 2, 4)}
+    assert whole.to_json()["options"] == {"scales": "1,2,4"} and "calls for: --scales 1,2,4" in whole.to_text()
     assert found["scales"].option == "--scales 1,2,4"
     assert found["alpha"].verdict == NO and found["sampling"].verdict == NOT_KNOWN
 
@@ -356,10 +361,11 @@ def test_medians():
 
 def test_options_are_those_of_train():
     source = Path(plan.__file__).read_text(encoding="utf-8")
-    named = sorted(set(re.findall(r'"(--[a-z]+ [a-z]+)"', source))) + [f"--scales {plan.SCALES}"]
-    assert named[:-1] == ["--exposure affine", "--lens keep", "--masks auto", "--missing skip"]
-    for option in named:
-        cli.build_parser().parse_args(["train", "SCENE", "--out", "DIR", *option.split(" ")])
+    named = dict(re.findall(r'{"([a-z]+)": "([a-z]+)"}', source))
+    assert named == {"exposure": "affine", "lens": "keep", "masks": "auto", "missing": "skip"}
+    for name, value in {**named, "scales": plan.SCALES}.items():
+        words = as_words({name: value}).split(" ")
+        assert getattr(cli.build_parser().parse_args(["train", "SCENE", "--out", "DIR", *words]), name) == value
 
 
 def test_inspect_of_a_capture(tmp_path, capsys):

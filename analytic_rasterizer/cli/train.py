@@ -18,7 +18,6 @@ from ..training import PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
-from ..training.health import flag
 from ..training.options import (
     BACKGROUNDS,
     DENSITIES,
@@ -26,6 +25,7 @@ from ..training.options import (
     PRESETS,
     RANDOM_BACKGROUND,
     TIMES,
+    flag,
     preset_values,
 )
 from ..training.reports import process_age

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..distributed.ranks import Ranks
 from .captures import IMAGES
-from .options import TrainingOptions
+from .options import TrainingOptions, as_words
 from .plan import CapturePlan, plan_capture, stops_of_photographs
 
 
@@ -53,7 +53,7 @@ def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Colle
     if isinstance(plan, str):
         return Settled(options, given, {}, [], [f"{scene}: not looked at, --effects auto takes nothing: {plan}"], {})
     defaults = {field.name: field.default for field in fields(TrainingOptions)}
-    values = {name: _value(text, defaults.get(name)) for name, text in plan.options.items()}
+    values = plan.options
     kept = [
         name
         for name in values
@@ -67,12 +67,13 @@ def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Colle
     given = given | {name: value for name, value in taken.items() if name in given}
     lines = []
     if ranks.is_first:
-        lines = [*plan.to_lines(), f"--effects auto takes {_shown(taken, plan) or 'nothing'}"]
-        left = _shown([name for name in kept if str(_of(options, given, name)) != str(values[name])], plan)
+        lines = [*plan.to_lines(), f"--effects auto takes {as_words(taken) or 'nothing'}"]
+        left = {name: values[name] for name in kept if _of(options, given, name) != values[name]}
         if left:
-            lines[-1] += f", and not {left}: another value is given"
-        if set(alone) & set(values):
-            lines[-1] += f", and not {_shown(alone, plan)}, which {ranks.world} processes cannot learn: train on one"
+            lines[-1] += f", and not {as_words(left)}: another value is given"
+        refused = {name: values[name] for name in alone if name in values}
+        if refused:
+            lines[-1] += f", and not {as_words(refused)}, which {ranks.world} processes cannot learn: train on one"
     return Settled(replace(options, **changes), given, taken, lines, [], plan.stops)
 
 
@@ -115,13 +116,5 @@ def _look(scene, given: dict[str, Any]) -> CapturePlan | str:
         return str(error) or type(error).__name__
 
 
-def _value(text: str, default: Any) -> Any:
-    return tuple(map(int, text.split(","))) if isinstance(default, tuple) else text
-
-
 def _of(options: TrainingOptions, given: dict[str, Any], name: str) -> Any:
     return given[name] if name in given else getattr(options, name)
-
-
-def _shown(names: Collection[str], plan: CapturePlan) -> str:
-    return " ".join(f"--{name} {plan.options[name]}" for name in names)

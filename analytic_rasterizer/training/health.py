@@ -12,7 +12,7 @@ from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
 from ..io.scenes import numbers_of
 from .model import render
-from .options import TrainingOptions
+from .options import TrainingOptions, flag
 from .pictures import Pictures
 from .schedule import Progress
 
@@ -163,8 +163,3 @@ def _about_pictures(trainer: Trainer) -> str:
     truths = (pictures.truth(min(pictures.colors), view) for view in range(len(pictures.views)))
     empty = all(bool((truth == truth[:, :1, :1]).all()) for truth in truths)
     return "; there is nothing in the pictures, each of which has one colour" if empty else ""
-
-
-def flag(name: str) -> str:
-    """An option as the command line spells it."""
-    return "--" + name.replace("_", "-")

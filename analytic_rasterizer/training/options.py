@@ -70,6 +70,21 @@ def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:
     return tuple(finest_repeats if several and scale == min(scales) else 1 for scale in scales)
 
 
+def flag(name: str) -> str:
+    """An option as the command line spells it."""
+    return "--" + name.replace("_", "-")
+
+
+def value_in_words(value: Any) -> str:
+    """A value as the command line spells it: "1,2,4" for (1, 2, 4)."""
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def as_words(options: dict[str, Any]) -> str:
+    """Options with their values as the command line spells them: "--scales 1,2 --exposure affine"."""
+    return " ".join(f"{flag(name)} {value_in_words(value)}" for name, value in options.items())
+
+
 def is_time(value: float) -> bool:
     """Whether a number is a time of `TrainingOptions`."""
     return 0 <= value <= 1 or (1 < value < math.inf and value == int(value))

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from .evidence import (
 )
 from .extent import outliers_of
 from .layouts import Capture, Photograph
+from .options import as_words, value_in_words
 from .photographs import TURNED, Header, read_header
 from .placement import offset_of
 
@@ -49,7 +50,7 @@ ALIASED_SHARE, SCALES_SHARE = 0.1, 0.05  # of the points: single ones are recons
 GRID = 17  # points along each side of a picture, where lenses are measured
 NAMED = 5  # photographs in a line
 
-SCALES = "1,2,4,8"
+SCALES = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,9 @@ class Finding:
         number: What was measured; None: nothing could be, or it is not finite.
         unit: Of the number.
         verdict: YES, NO or NOT_KNOWN: whether the effect matters here.
-        option: Of `train`, with its value, that acts on it; "" where there is none, or none is needed.
         reason: What the number is, and what follows.
+        options: The option of `train` that acts on it, and its value: {"scales": (1, 2)}. Empty where there is none, or
+            none is needed.
         photographs: Names of files that it is about.
     """
 
@@ -70,9 +72,14 @@ class Finding:
     number: float | None
     unit: str
     verdict: str
-    option: str
     reason: str
+    options: dict[str, Any] = field(default_factory=dict, hash=False)
     photographs: tuple[str, ...] = ()
+
+    @property
+    def option(self) -> str:
+        """`options` as the command line spells them: "--scales 1,2"."""
+        return as_words(self.options)
 
     def to_text(self) -> str:
         """One line."""
@@ -80,6 +87,11 @@ class Finding:
         named = ", ".join(self.photographs[:NAMED]) + (", .." if len(self.photographs) > NAMED else "")
         parts = [f"{shown}{self.reason}", named, self.option]
         return f"{self.effect:<16} {self.verdict:<9}  {'; '.join(filter(None, parts))}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON holds it; the option in words."""
+        names = ("effect", "number", "unit", "verdict", "option", "reason", "photographs")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -103,10 +115,10 @@ class CapturePlan:
     stops: dict[Path, torch.Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     @property
-    def options(self) -> dict[str, str]:
-        """Options of `train` that the capture calls for, and their values: {"exposure": "affine"}."""
-        chosen = (finding.option.removeprefix("--").split(" ") for finding in self.findings if finding.verdict == YES)
-        return {words[0]: words[1] for words in chosen if len(words) == 2}
+    def options(self) -> dict[str, Any]:
+        """Options of `train` that the capture calls for, and their values: {"exposure": "affine", "scales": (1, 2)}."""
+        called_for = (finding.options for finding in self.findings if finding.verdict == YES)
+        return {name: value for options in called_for for name, value in options.items()}
 
     def to_lines(self) -> list[str]:
         """A line of what was looked at, then one for each finding: the first lines of `train`."""
@@ -115,14 +127,13 @@ class CapturePlan:
 
     def to_text(self) -> str:
         """`to_lines`, and the options."""
-        options = " ".join(f"--{name} {value}" for name, value in self.options.items())
-        return "\n".join([*self.to_lines(), f"calls for: {options or 'nothing special'}"])
+        return "\n".join([*self.to_lines(), f"calls for: {as_words(self.options) or 'nothing special'}"])
 
     def to_json(self) -> dict[str, Any]:
-        """Everything but `stops`, as JSON holds it."""
-        values = asdict(self) | {"options": self.options}
-        del values["stops"]
-        return values
+        """Everything but `stops`, as JSON holds it; options in words."""
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "stops"}
+        values["findings"] = [finding.to_json() for finding in self.findings]
+        return values | {"options": {name: value_in_words(value) for name, value in self.options.items()}}
 
 
 class _Survey(NamedTuple):
@@ -231,7 +242,7 @@ def _survey(folder: Path, images: str, cameras: str | None, most: int, among: se
 
 
 def _unknown(effect: str, unit: str, reason: str) -> Finding:
-    return Finding(effect, None, unit, NOT_KNOWN, "", reason)
+    return Finding(effect, None, unit, NOT_KNOWN, reason)
 
 
 def _names(items: Sequence[Photograph]) -> tuple[str, ...]:
@@ -262,38 +273,39 @@ def displacement_of(view: io.View) -> float:
 def _lens(items: list[Photograph]) -> Finding:
     with_lens = [item for item in items if item.view.lens is not None]
     if not with_lens:
-        return Finding("lens", 0.0, "px", NO, "", "from a pinhole: no camera has a lens")
+        return Finding("lens", 0.0, "px", NO, "from a pinhole: no camera has a lens")
     distinct = {(v.lens, v.width, v.height, v.fx, v.fy, v.middle): v for v in (item.view for item in with_lens)}
+    keep = {"lens": "keep"}
     largest = max(displacement_of(view) for view in spread_out(list(distinct.values()), MOST_PHOTOGRAPHS))
     which = f"{len(with_lens)} of {len(items)} photographs have a lens ({lens_models(with_lens)})"
     if math.isinf(largest):
         reason = f"{which}, and show more than a half space, which no pinhole does"
-        return Finding("lens", None, "px", YES, "--lens keep", reason)
+        return Finding("lens", None, "px", YES, reason, keep)
     needed = largest > LENS
     reason = f"is the largest displacement from a pinhole; {which}"
-    return Finding("lens", largest, "px", YES if needed else NO, "--lens keep" if needed else "", reason)
+    return Finding("lens", largest, "px", YES if needed else NO, reason, keep if needed else {})
 
 
 def _intervals(evidence: Evidence, items: list[Photograph]) -> tuple[Finding, Finding]:
     """Whether the range of sampling intervals calls for integration over pixels, and for several scales."""
     unit, ranges = "% of points", interval_ranges(evidence)
 
-    def finding(effect: str, limit: float, least: float, median: str, option: str, advice: str) -> Finding:
+    def finding(effect: str, limit: float, least: float, median: str, options: dict[str, Any], advice: str) -> Finding:
         if not len(ranges):
             return _unknown(effect, unit, _why_unknown(evidence))
         share = (ranges > limit).double().mean().item()
         needed = share >= least
         reason = f"have sampling intervals that differ by more than {limit:g}{median}{advice if needed else ''}"
-        return Finding(effect, 100 * share, unit, YES if needed else NO, option if needed else "", reason)
+        return Finding(effect, 100 * share, unit, YES if needed else NO, reason, options if needed else {})
 
     median = f" (median {ranges.median():.2f})" if len(ranges) else ""
     advice = ": integrate over pixels, as the default footprint does"
-    sampling = finding("sampling", ALIASED, ALIASED_SHARE, median, "", advice)
-    stored = sorted({scale for item in items for scale in item.files})
+    sampling = finding("sampling", ALIASED, ALIASED_SHARE, median, {}, advice)
+    stored = tuple(sorted({scale for item in items for scale in item.files}))
     if len(stored) > 1:
-        option = f"--scales {','.join(map(str, stored))}"
-        return sampling, Finding("scales", len(stored), "sizes", YES, option, "of each picture are in the capture")
-    return sampling, finding("scales", SEVERAL_SCALES, SCALES_SHARE, "", f"--scales {SCALES}", "")
+        reason = "of each picture are in the capture"
+        return sampling, Finding("scales", len(stored), "sizes", YES, reason, {"scales": stored})
+    return sampling, finding("scales", SEVERAL_SCALES, SCALES_SHARE, "", {"scales": SCALES}, "")
 
 
 def _outlying(items: list[Photograph], outliers: dict[int, float]) -> Finding:
@@ -302,14 +314,14 @@ def _outlying(items: list[Photograph], outliers: dict[int, float]) -> Finding:
         return _unknown(effect, unit, "fewer than 3 photographs")
     reason = "have a camera far from all others" + (", and are left out" if outliers else "")
     found = _names([items[place] for place in outliers])
-    return Finding(effect, len(outliers), unit, YES if outliers else NO, "", reason, found)
+    return Finding(effect, len(outliers), unit, YES if outliers else NO, reason, photographs=found)
 
 
 def _far(views: list[io.View], points: torch.Tensor | None) -> Finding:
     offset = offset_of(views, points)
     distance = 0.0 if offset is None else math.hypot(*offset)
     reason = "to take off" if offset is None else "from zero, which are taken off, and written to the files"
-    return Finding("far from zero", distance, "world units", NO if offset is None else YES, "", reason)
+    return Finding("far from zero", distance, "world units", NO if offset is None else YES, reason)
 
 
 # ------------------------------------------------------------------------------------ pixels
@@ -346,8 +358,8 @@ def _colors(survey: _Survey) -> tuple[Finding, Finding]:
             reason += (
                 f"; without {'tracks this may be hidden points' if evidence.points else 'points this may be gloss'}"
             )
-        option = "--exposure affine" if verdict == YES else ""
-        found.append(Finding(effect, number, units[effect], verdict, option, reason))
+        options = {"exposure": "affine"} if verdict == YES else {}
+        found.append(Finding(effect, number, units[effect], verdict, reason, options))
     return tuple(found)
 
 
@@ -368,7 +380,7 @@ def _blur(evidence: Evidence, items: list[Photograph]) -> Finding:
     least = 2 ** sharpness[sharpness.isfinite()].min().item()
     reason = f"of {known} have less of the finest details than others at the same points, down to {least:.0%}"
     names = _names([items[place] for place in blurred])
-    return Finding(effect, len(blurred), unit, YES if blurred else NO, "", reason, names)
+    return Finding(effect, len(blurred), unit, YES if blurred else NO, reason, photographs=names)
 
 
 def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
@@ -376,7 +388,7 @@ def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
     reason = f"of {len(items)} looked at are transparent somewhere" + (
         ": the background shows through" if found else ""
     )
-    return Finding("alpha", len(found), "photographs", YES if found else NO, "", reason)
+    return Finding("alpha", len(found), "photographs", YES if found else NO, reason)
 
 
 # ------------------------------------------------------------------------------------ files
@@ -384,17 +396,17 @@ def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
 
 def _masks(capture: Capture, items: list[Photograph]) -> Finding:
     masked = sum(item.mask is not None for item in items)
-    verdict, option = (YES, "--masks auto") if masked else (NO, "")
+    verdict, options = (YES, {"masks": "auto"}) if masked else (NO, {})
     reason = f"of {len(items)} have a mask"
     if capture.ignored_masks:
         reason += f"; {capture.ignored_masks} files of masks belong to no convention, and are ignored"
-    return Finding("masks", masked, "photographs", verdict, option, reason)
+    return Finding("masks", masked, "photographs", verdict, reason, options)
 
 
 def _missing(capture: Capture, folder: Path) -> Finding:
     names = tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in capture.missing)
-    verdict, option = (YES, "--missing skip") if names else (NO, "")
-    return Finding("missing pictures", len(names), "files", verdict, option, "are not there", names)
+    verdict, options = (YES, {"missing": "skip"}) if names else (NO, {})
+    return Finding("missing pictures", len(names), "files", verdict, "are not there", options, names)
 
 
 def _files(pairs: list[tuple[Photograph, Header]]) -> tuple[Finding, Finding]:
@@ -404,10 +416,12 @@ def _files(pairs: list[tuple[Photograph, Header]]) -> tuple[Finding, Finding]:
     reason = "are to be turned by EXIF, and used as stored"
     if turned:
         reason += f"; the sizes of {open_ones} do not tell whether that fits the camera"
-    turns = Finding("EXIF turns", len(turned), "photographs", YES if turned else NO, "", reason, _names(turned))
+    verdict = YES if turned else NO
+    turns = Finding("EXIF turns", len(turned), "photographs", verdict, reason, photographs=_names(turned))
     wrong = [item for item, header in pairs if not header.fits(item.view)]
     quarter = sum(header.fits_turned(item.view) for item, header in pairs if not header.fits(item.view))
     reason = "do not have the proportions of their camera"
     if wrong:
         reason += f"; {quarter} do after a quarter turn, which train refuses; it stretches the camera of the others"
-    return turns, Finding("wrong sizes", len(wrong), "photographs", YES if wrong else NO, "", reason, _names(wrong))
+    verdict = YES if wrong else NO
+    return turns, Finding("wrong sizes", len(wrong), "photographs", verdict, reason, photographs=_names(wrong))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from .health import flag
-from .options import TrainingOptions
+from .options import TrainingOptions, flag
 from .schedule import SH_SHARE, changes_at, growth_times, steps_at
 
 GROWTH = ("densify_from", "densify_until", "densify_every", "prune_opacity")  # of every density control
