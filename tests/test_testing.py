@@ -1,13 +1,12 @@
 """testing.cuda_on_cpu: what asks for CUDA gets tensors on the CPU, and afterwards everything is as before."""
 
-import json
 import os
 
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED, python_path
-from processes import DEADLINE, run_program
+from conftest import python_path
+from processes import run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import testing
@@ -172,30 +171,3 @@ def test_pictures_and_gradients_are_those_of_the_cpu():
         moved = program("cuda")
     for one, other in zip(plain, moved):
         assert torch.equal(one, other)
-
-
-RUNNER = SHARED / "compat" / "run.py"
-# Of the repositories' own files: their renderer, density control and optimiser, with this context instead of theirs.
-REPOSITORIES = {"3dgs-2023": "", "3dgs-2024": "", "mip-splatting": "", "3dgs-mcmc": "mcmc"}
-PROGRAM = """
-import importlib.util, json, sys
-from analytic_rasterizer import testing
-spec = importlib.util.spec_from_file_location("compat_run", sys.argv[1])
-runner = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(runner)
-runner.cuda_to_cpu = testing.cuda_on_cpu
-print("@@@" + json.dumps(runner.run_one(sys.argv[2], "cpu", False)))
-"""
-
-
-@pytest.mark.skipif(not RUNNER.exists(), reason="needs the optional ../shared/compat next to the project")
-@pytest.mark.parametrize("name", REPOSITORIES)
-def test_a_repository_as_it_is(name):
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("ANALYTIC_RASTERIZER_")}
-    environment |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": python_path()}
-    environment["ANALYTIC_RASTERIZER_DIALECT"] = REPOSITORIES[name]
-    done = run_program(PROGRAM, RUNNER, name, environment=environment, timeout=2 * DEADLINE)
-    found = [line.removeprefix("@@@") for line in done.stdout.splitlines() if line.startswith("@@@")]
-    assert found, done.stderr[-2000:]
-    report = json.loads(found[-1])
-    assert report["result"] == "pass", (report["stages"], report.get("error"), report.get("at"))
