@@ -254,6 +254,67 @@ def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
     check_error([arg.format(tmp_path) for arg in args], capsys, message)
 
 
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["trian", "SCENE"], "argument COMMAND: invalid choice: 'trian' (choose from"),
+        (["trian", "SCENE"], "; did you mean train? (see python -m analytic_rasterizer --help)"),
+        (
+            ["--versoin"],
+            "unrecognized arguments: --versoin; did you mean --version? (see python -m",
+        ),
+        (
+            ["train", "SCENE", "--ouut", "DIR"],
+            "arguments: --ouut; did you mean --out? (see python -m",
+        ),
+        (
+            ["train", "SCENE", "--out", "DIR", "--max_gaussians=3"],
+            "; did you mean --max-gaussians? (see",
+        ),
+        (["train", "SCENE", "--out", "DIR", "--iter", "3"], "arguments: --iter; did you mean --iterations? (see"),
+        (["train", "SCENE", "--out", "DIR", "--iter", "3"], "(see python -m analytic_rasterizer train --help)"),
+        (
+            ["train", "SCENE", "--picture-memory", "1"],
+            "; did you mean --picture-memory-gpu or --picture-memory-host? (see",
+        ),
+        (["train", "SCENE", "--out", "DIR", "--preset", "quik"], "; did you mean quick? (see"),
+        (["train", "SCENE", "--out", "DIR", "--xyzzy"], "unrecognized arguments: --xyzzy (see"),
+        (["render", "a.ply", "-out", "DIR"], "unrecognized arguments: -out; did you mean --out? (see"),
+        (["render", "a.ply", "--out", "DIR", "--scle", "2"], "; did you mean --scales? (see"),
+        (["evaluate", "DIR", "--pictuers", "1"], "; did you mean --pictures? (see"),
+        (["view", "a.ply", "--sever"], "; did you mean --server? (see"),
+        (["view", "a.ply", "--no-brows"], "; did you mean --no-browser? (see"),
+        (["bake", "a.ply", "--outt", "b.ply"], "; did you mean --out? (see"),
+        (["inspect", "a.ply", "--toleranse", "1"], "; did you mean --tolerance? (see"),
+        (["pareto", "a.ply", "--vews", "v.json"], "; did you mean --views? (see"),
+    ],
+)
+def test_what_is_misspelt_or_cut_short_is_said_in_one_line(capsys, args, message):
+    check_error(args, capsys, message)
+
+
+def test_no_command_takes_parts_of_names(capsys):
+    """Nor does any of its options: `--out` of `--output` would be another one day."""
+    whole = cli.build_parser()
+    commands = next(action for action in whole._actions if action.dest == argparse.SUPPRESS and action.choices).choices
+    assert len(commands) == len(cli.COMMANDS)
+    for name, parser in commands.items():
+        for option in [option for action in parser._actions for option in action.option_strings if len(option) > 3]:
+            if option[:-1] not in parser._option_string_actions:
+                with pytest.raises(SystemExit):
+                    whole.parse_args([name, option[:-1]])
+                said = capsys.readouterr().err
+                assert f"unrecognized arguments: {option[:-1]}" in said and said.count("\n") == 1
+                assert option in said or option == "--scale"
+
+
+def test_values_that_begin_like_options(capsys):
+    """Negative numbers are values, and what follows -- is a name."""
+    check_error(["train", "SCENE", "--out", "DIR", "--seconds", "-inf"], capsys, "--seconds: expected one argument")
+    args = cli.build_parser().parse_args(["train", "--out", "DIR", "--seed", "-3", "--", "--scene"])
+    assert (args.scene, args.seed) == ("--scene", -3)
+
+
 def test_errors_of_a_process(tmp_path):
     done = run("render", "none.ply", "--views", "none.json", "--out", ".", cwd=tmp_path)
     assert done.returncode == 2

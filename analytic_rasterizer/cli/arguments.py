@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 import os
 import re
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from io import StringIO
 from pathlib import Path
 
@@ -28,16 +29,59 @@ USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, Memory
 VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
 LARGER = "larger numbers in --scales make them smaller"
 ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF")
+MOST_NAMES = 3  # that may have been meant
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 """What `--help` shows for a value, by its type."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are one line, and which takes the numbers of a colour as three arguments, too."""
+    """An ArgumentParser whose errors are one line, and which takes the numbers of a colour as three arguments, too.
+
+    It takes no option by a part of its name: programs that call a command would break with the next option that begins
+    so. The error for an unknown name says which is near.
+    """
+
+    def __init__(self, **others):
+        super().__init__(allow_abbrev=False, **others)
 
     def parse_known_args(self, args=None, namespace=None):
-        """As of ArgumentParser, with `--background R G B` in `args` as one argument; for `namespace` see there."""
-        return super().parse_known_args(_with_joined_colors(sys.argv[1:] if args is None else args), namespace)
+        """As of ArgumentParser, with `--background R G B` in `args` as one argument; for `namespace` see there.
+
+        Options that do not exist are an error.
+        """
+        args = _with_joined_colors(sys.argv[1:] if args is None else args)
+        unknown = self._unknown_options(args)
+        if unknown:  # before what argparse says of an option that is required, and here has another name
+            near = dict.fromkeys(name for option in unknown for name in self._near_options(option))
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{_did_you_mean(near)}")
+        return super().parse_known_args(args, namespace)
+
+    def _unknown_options(self, args: list[str]) -> list[str]:
+        """The names among the arguments that no option of this parser has; those after a command are the command's."""
+        unknown = []
+        for text in args:
+            is_option = re.match(r"--?[A-Za-z][^ ]*$", text) is not None and not _is_float(text)
+            if text == "--" or (self._subparsers is not None and not is_option):
+                break
+            name = text.partition("=")[0]
+            if is_option and name not in self._option_string_actions:
+                unknown.append(name)
+        return unknown
+
+    def _near_options(self, name: str) -> list[str]:
+        """The options that a name may stand for: those that begin with it, or else the most similar one."""
+        actions = [action for action in self._actions if action.help != argparse.SUPPRESS]
+        options = [option for action in actions for option in action.option_strings]
+        begun = [option for option in options if option.startswith(name)]
+        return begun[:MOST_NAMES] or difflib.get_close_matches(name, options, 1)
+
+    def _check_value(self, action, value):
+        """As of ArgumentParser; the error names the choice that is near, of commands as well."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += _did_you_mean(difflib.get_close_matches(str(value), map(str, action.choices), 1))
+            raise
 
     def error(self, message):
         """Prints `message` as one line, and ends the process with the exit code 2."""
@@ -45,6 +89,12 @@ class Parser(argparse.ArgumentParser):
             message += "; lists have commas and no spaces: 1,2,4"
         report(f"{message} (see {self.prog} --help)")
         self.exit(2)
+
+
+def _did_you_mean(names: Iterable[str]) -> str:
+    """How an error goes on that knows what may have been meant."""
+    near = " or ".join(names)
+    return f"; did you mean {near}?" if near else ""
 
 
 def _with_joined_colors(args: list[str]) -> list[str]:
@@ -57,11 +107,16 @@ def _with_joined_colors(args: list[str]) -> list[str]:
     return joined
 
 
-def _is_number(text: str) -> bool:
+def _is_float(text: str) -> bool:
     try:
-        return math.isfinite(float(text))
+        float(text)
     except ValueError:
         return False
+    return True
+
+
+def _is_number(text: str) -> bool:
+    return _is_float(text) and math.isfinite(float(text))
 
 
 def run_command(parse: Callable[[], argparse.Namespace]) -> int:
@@ -153,7 +208,7 @@ def add_scales(parser, kind: Callable, text: str, default: tuple | None = None) 
     """
     several = "N" if kind is reduction else "N,N,.."
     parser.add_argument("--scales", type=kind, default=default, metavar=several, help=text)
-    # Otherwise --scale would be taken for --scales, with another meaning than it had.
+    # It had another meaning than --scales: whoever gives it has to think again.
     parser.add_argument("--scale", type=_former_scale, help=argparse.SUPPRESS)
 
 
