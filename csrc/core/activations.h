@@ -1,6 +1,6 @@
 // From the parameters that a training optimises to the rasterizer's: exp of scales, unit quaternions, the logistic
 // function of opacities; and the 3D filter that widens Gaussians. The adjoints compute the values again.
-// cpu/activations.cpp and cuda/activations.cu run all of them.
+// cpu/activations.cpp and cuda/training/activations.cu run all of them.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
 // What density control does to every Gaussian in every step: `observe` adds a picture to its statistics, `add_noise`
-// moves its mean at random. cpu/activations.cpp and cuda/activations.cu call both.
+// moves its mean at random. cpu/activations.cpp and cuda/training/activations.cu call both.
 #pragma once
 
 #include <cmath>

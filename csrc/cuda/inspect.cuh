@@ -7,7 +7,7 @@
 #include "core/camera.h"
 #include "core/inspect.h"
 #include "cuda/launch.cuh"
-#include "cuda/tile.cuh"
+#include "cuda/tile/stage.cuh"
 
 namespace ar::cuda {
 

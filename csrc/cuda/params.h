@@ -13,7 +13,7 @@
 #include "core/camera.h"
 #include "core/rows.h"
 #include "core/weight.h"
-#include "cuda/chunk_plan.h"
+#include "cuda/bin/chunk_plan.h"
 
 namespace ar::cuda {
 

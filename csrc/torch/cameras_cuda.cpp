@@ -1,10 +1,10 @@
-// cameras.h: allocates, and launches the kernels of cuda/cameras.h on the current stream.
+// cameras.h: allocates, and launches the kernels of cuda/project/cameras.h on the current stream.
 #include "torch/cameras.h"
 
 #include <ATen/Dispatch.h>
 #include <ATen/ops/empty.h>
 
-#include "cuda/cameras.h"
+#include "cuda/project/cameras.h"
 #include "torch/cuda_stream.h"
 
 namespace ar::ops {

@@ -6,7 +6,7 @@
 
 #include <mutex>
 
-#include "cuda/pair_guess.h"
+#include "cuda/bin/pair_guess.h"
 #include "torch/backend.h"
 #include "torch/pointers.h"
 

@@ -2,7 +2,7 @@
 // waits for the device.
 #include <ATen/ops/empty.h>
 
-#include "cuda/training.h"
+#include "cuda/training/training.h"
 #include "torch/cuda_stream.h"
 #include "torch/training.h"
 

@@ -1,4 +1,4 @@
-#include "cuda/pair_guess.h"
+#include "cuda/bin/pair_guess.h"
 
 #include <gtest/gtest.h>
 

@@ -1,5 +1,5 @@
 // How far a lens is a map, and how far a picture sees through it: `fold` and `reach` of core/lens.h, by rays in many
-// directions from the axis and at many angles. A library for torch/cameras.cpp and cuda/cameras.cu, which share the
+// directions from the axis and at many angles. A library for torch/cameras.cpp and cuda/project/cameras.cu, which share the
 // rays among threads. In double: near a fold derivatives cancel.
 #pragma once
 

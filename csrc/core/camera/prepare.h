@@ -1,6 +1,6 @@
 // What kernels read of a camera, from what users give, and the adjoint: the matrices of a pose and intrinsics
 // (prepare_camera), and a Lens of numbers and tensors (LensSource). In double, rounded once. torch/cameras.cpp and
-// cuda/cameras.cu call it.
+// cuda/project/cameras.cu call it.
 #pragma once
 
 #include "core/camera/limits.h"

@@ -6,7 +6,7 @@
 
 #include "cuda/dispatch.h"
 #include "cuda/launch.cuh"
-#include "cuda/tile.cuh"
+#include "cuda/tile/stage.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

@@ -9,7 +9,7 @@
 #pragma once
 
 #include "cuda/moment/cut_lists.h"
-#include "cuda/tile.cuh"
+#include "cuda/tile/stage.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

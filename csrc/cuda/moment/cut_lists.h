@@ -5,7 +5,7 @@
 
 #include <algorithm>
 
-#include "cuda/chunk_plan.h"
+#include "cuda/bin/chunk_plan.h"
 
 namespace ar::cuda {
 

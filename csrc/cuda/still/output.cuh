@@ -1,7 +1,7 @@
 // A library for the kernels of front.cuh and tail.cuh: addresses of checkpoints, and the pixels of the images.
 #pragma once
 
-#include "cuda/tile.cuh"
+#include "cuda/tile/pixels.cuh"
 
 namespace ar::cuda {
 

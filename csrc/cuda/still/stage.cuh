@@ -4,7 +4,7 @@
 
 #include <type_traits>
 
-#include "cuda/tile.cuh"
+#include "cuda/tile/stage.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

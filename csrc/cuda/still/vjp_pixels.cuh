@@ -2,7 +2,7 @@
 // in registers or in shared memory.
 #pragma once
 
-#include "cuda/tile.cuh"
+#include "cuda/tile/pixels.cuh"
 
 namespace ar::cuda {
 

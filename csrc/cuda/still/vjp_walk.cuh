@@ -4,6 +4,7 @@
 #pragma once
 
 #include "cuda/still/vjp_sums.cuh"
+#include "cuda/tile/stage.cuh"
 
 namespace ar::cuda {
 

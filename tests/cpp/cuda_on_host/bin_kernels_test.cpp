@@ -8,9 +8,9 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/bin.cuh"
-#include "cuda/splat_tiles.cuh"
-#include "cuda/tile.cuh"
+#include "cuda/bin/bin.cuh"
+#include "cuda/project/project.cuh"
+#include "cuda/tile/lists.cuh"
 
 namespace ar::cuda {
 namespace {

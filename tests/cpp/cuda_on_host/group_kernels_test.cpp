@@ -6,7 +6,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/channels/groups_vjp.cuh"
-#include "cuda/project_vjp.cuh"
+#include "cuda/project/project_vjp.cuh"
 #include "random_splats.h"
 
 namespace ar::cuda {

@@ -5,12 +5,12 @@
 #include <gtest/gtest.h>
 
 #include "core/inspect.h"
+#include "cuda/bin/plan.cuh"
 #include "cuda/moment/listed.cuh"
 #include "cuda/moment/maps.cuh"
 #include "cuda/moment/vjp_segments.cuh"
 #include "cuda/moment/vjp_walk.cuh"
 #include "cuda/moment/walk.cuh"
-#include "cuda/plan.cuh"
 #include "random_splats.h"
 
 namespace ar::cuda {

@@ -5,7 +5,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/project_vjp.cuh"
+#include "cuda/project/project_vjp.cuh"
 
 namespace ar::cuda {
 namespace {

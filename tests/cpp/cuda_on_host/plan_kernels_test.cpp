@@ -8,8 +8,8 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include "cuda/bin/plan.cuh"
 #include "cuda/moment/cut_lists.h"
-#include "cuda/plan.cuh"
 
 namespace ar::cuda {
 namespace {

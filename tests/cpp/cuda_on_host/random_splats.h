@@ -5,7 +5,7 @@
 #include <random>
 #include <vector>
 
-#include "cuda/tile.cuh"
+#include "cuda/tile/stage.cuh"
 
 namespace ar::cuda {
 

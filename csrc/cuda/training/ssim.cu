@@ -7,7 +7,7 @@
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
-#include "cuda/training.h"
+#include "cuda/training/training.h"
 #include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 

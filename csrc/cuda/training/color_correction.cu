@@ -4,7 +4,7 @@
 #include "core/color_correction.h"
 
 #include "cuda/launch.cuh"
-#include "cuda/training.h"
+#include "cuda/training/training.h"
 #include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 

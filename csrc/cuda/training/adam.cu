@@ -3,7 +3,7 @@
 #include "core/adam.h"
 
 #include "cuda/launch.cuh"
-#include "cuda/training.h"
+#include "cuda/training/training.h"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

@@ -8,9 +8,9 @@
 #include <type_traits>
 
 #include "core/bin.h"
+#include "cuda/bin/sort.cuh"
 #include "cuda/launch.cuh"
 #include "cuda/params.h"
-#include "cuda/sort.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

@@ -2,9 +2,9 @@
 // declared in params.h.
 #include <algorithm>
 
-#include "cuda/bin.cuh"
+#include "cuda/bin/bin.cuh"
+#include "cuda/bin/plan.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/plan.cuh"
 
 namespace ar::cuda {
 namespace {

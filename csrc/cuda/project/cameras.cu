@@ -1,7 +1,7 @@
 // Cameras and lenses from what users give, and adjoints, for torch/cameras_cuda.cpp: small kernels, so that a frame
 // neither copies from the host nor waits for it. What limits a lens is searched by a block per direction and camera,
 // whose threads share the angles.
-#include "cuda/cameras.h"
+#include "cuda/project/cameras.h"
 
 #include "cuda/launch.cuh"
 

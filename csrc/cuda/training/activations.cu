@@ -5,7 +5,7 @@
 #include "core/density.h"
 
 #include "cuda/launch.cuh"
-#include "cuda/training.h"
+#include "cuda/training/training.h"
 #include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 

@@ -5,7 +5,7 @@
 #pragma once
 
 #include "cuda/launch.cuh"
-#include "cuda/project.cuh"
+#include "cuda/project/project.cuh"
 
 namespace ar::cuda {
 

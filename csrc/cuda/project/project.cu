@@ -5,7 +5,7 @@
 #include <set>
 
 #include "cuda/launch.cuh"
-#include "cuda/project_vjp.cuh"
+#include "cuda/project/project_vjp.cuh"
 
 namespace ar::cuda {
 namespace {

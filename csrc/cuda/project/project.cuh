@@ -4,15 +4,22 @@
 // reads.
 #pragma once
 
+#include "core/bin.h"
 #include "cuda/launch.cuh"
-#include "cuda/sh_rows.cuh"
-#include "cuda/splat_tiles.cuh"
+#include "cuda/params.h"
+#include "cuda/project/sh_rows.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {
 
 __device__ inline uint32_t depth_key(float depth) {
   return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // + 0: -0 becomes 0
+}
+
+/// The tiles of a support, for each of which bin writes a pair.
+__device__ inline SplatTiles splat_tiles_of(const Support<float>& support, TileGrid grid) {
+  const TileBox box = find_tiles(support, grid);
+  return {box.mask, box.row * grid.columns() + box.column, box.count};
 }
 
 /// What bin reads. Params: ProjectParams or ShapeRowsParams.
