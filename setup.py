@@ -93,14 +93,7 @@ if WITH_CUDA and not torch.cuda.is_available():
 SOURCES = [str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in sorted(ROOT.glob(f"csrc/{d}/*.cpp"))]
 if WITH_CUDA:
     # Those that take longest begin first, so that no core waits for them at the end.
-    slow = [
-        "moment/blend_vjp",
-        "moment/blend",
-        "still/blend",
-        "still/blend_vjp",
-        "project/project",
-        "channels/blend_vjp",
-    ]
+    slow = ["moment/blend_vjp", "moment/blend", "still/blend", "still/blend_vjp", "forward", "backward"]
     kernels = {str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/**/*.cu")}
     first = [f"csrc/cuda/{name}.cu" for name in slow]
     SOURCES = [*first, *SOURCES, *sorted(kernels - set(first))]

@@ -1,5 +1,5 @@
-// The table of blending: family of kernels, tiles and memory by footprint. csrc/torch asks for sizes, dispatch.cu for
-// the family. A test compares the names in Route with the kernels that are launched.
+// The table of blending: family of kernels, tiles and memory by footprint. csrc/torch asks for sizes, forward.cu and
+// backward.cu for the family. A test compares the names in Route with the kernels that are launched.
 //
 // | footprint                          | channels | tiles                          | family    |
 // |------------------------------------|----------|--------------------------------|-----------|
@@ -59,6 +59,11 @@ template <class Function> void visit_pixels(int footprint, Function&& f) {
 template <class F> constexpr Family family_of(int64_t channels) {
   if (F::kMoves) return Family::kMoment;
   return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
+}
+inline Family family_at(int footprint, int64_t channels) {
+  Family found = Family::kStill;
+  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
+  return found;
 }
 /// Calls f with what a lane blends of a footprint, if kFamily has kernels for it.
 template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {

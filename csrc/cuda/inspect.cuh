@@ -1,4 +1,4 @@
-// Kernel inspect; dispatch.cu launches it. It walks lists as blending does, and writes statistics of pixels and
+// Kernel inspect; forward.cu launches it. It walks lists as blending does, and writes statistics of pixels and
 // Gaussians (core/inspect.h).
 #pragma once
 

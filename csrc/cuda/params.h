@@ -222,43 +222,11 @@ struct RowGradsParams : ar::RowGradsParams<float> {
 
 AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 
-// Projection (project.cu).
+// The forward pass (forward.cu). `footprint`: index in the registry.
+
 void project(const ProjectParams& p, cudaStream_t stream);
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
-/// Leaves groups of 32 Gaussians without pairs to zero_culled_grads.
-void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
-/// `begun`: as in LaunchShape.
-void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
-void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
-void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream);
-void row_grads(const RowGradsParams& p, cudaStream_t stream);
-void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
-
-// Blending (dispatch.cu). `footprint`: index in the registry. Without p.channels.data the colours in the splats are
-// blended.
-void blend(int footprint, const BlendParams& p, cudaStream_t stream);
-/// The group of channels from `first` on.
-void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
-void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
-/// Of the current device, for route_of().
-int multiprocessors_of_device();
-int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid);
-// The families (still/, moment/, channels/).
-void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
-void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);
-void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
-void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
-void blend_channels(int footprint, const BlendParams& p, cudaStream_t stream);
-void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
-
-// Weights of a footprint (weight.cu).
-void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream);
-void weight(int footprint, const WeightParams<double>& p, cudaStream_t stream);
-void weight_vjp(int footprint, const WeightParams<float>& p, cudaStream_t stream);
-void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t stream);
-
-// Binning (bin.cu).
 
 /// Most splats or pairs that can be sorted.
 int64_t max_items();
@@ -292,7 +260,7 @@ void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);
 
-/// Where the device reports the number of pairs (pair_guess.h).
+/// Where the device reports the number of pairs (bin/pair_guess.h).
 struct PairFeedback {
   uint64_t* word;  ///< of the host
   uint32_t frame;
@@ -312,7 +280,43 @@ int tile_sort_result(TileGrid grid);
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 
+/// Of the current device, for route_of().
+int multiprocessors_of_device();
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream);
+/// Without p.channels.data the colours in the splats are blended, also by blend_vjp.
+void blend(int footprint, const BlendParams& p, cudaStream_t stream);
+
+void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
+
+// The backward pass (backward.cu).
+
+/// `begun`: as in LaunchShape.
+void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
+int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid);
+/// The group of channels from `first` on.
+void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
+void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
+/// Leaves groups of 32 Gaussians without pairs to zero_culled_grads.
+void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
+void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
+void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream);
+void row_grads(const RowGradsParams& p, cudaStream_t stream);
+
+// The families of blending, forward (blend.cu) and backward (blend_vjp.cu).
+
+void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_channels(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);
+void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
+void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
+
+// Weights of a footprint (weight.cu).
+
+void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream);
+void weight(int footprint, const WeightParams<double>& p, cudaStream_t stream);
+void weight_vjp(int footprint, const WeightParams<float>& p, cudaStream_t stream);
+void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t stream);
 
 }  // namespace ar::cuda

@@ -1,5 +1,5 @@
-// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. count_depths counts splats,
-// pairs and digits of depth keys, gives splats slots for gradients, and sets scratch memory to zero. By depth,
+// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); forward.cu launches them. count_depths counts
+// splats, pairs and digits of depth keys, gives splats slots for gradients, and sets scratch memory to zero. By depth,
 // emit_pairs writes a pair for each tile of a splat. emit_long_pairs does it for splats whose tiles are not among 8x8,
 // and writes all pairs of patches where room is short. By tile, tile_offsets finds the first pair of each tile and
 // reports the number of pairs to the host.

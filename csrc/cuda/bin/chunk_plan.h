@@ -1,5 +1,5 @@
 // The chunk plan: how lists are cut into chunks (front_chunks, ListCut), in which order work begins (ChunkPlan), and
-// how the checkpoints of still/ lie in memory (CheckpointLayout). plan_chunks (bin.cu) writes the plan by the kernels
+// how the checkpoints of still/ lie in memory (CheckpointLayout). plan_chunks writes the plan by the kernels
 // of plan.cuh, the kernels of blending read it, and blend_front counts the tiles that it leaves open in it.
 #pragma once
 

@@ -1,4 +1,4 @@
-// The kernels of plan_chunks; bin.cu launches them. count_work counts tiles and chunks by length. plan writes the
+// The kernels of plan_chunks; forward.cu launches them. count_work counts tiles and chunks by length. plan writes the
 // ChunkPlan (chunk_plan.h).
 #pragma once
 

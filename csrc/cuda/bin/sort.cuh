@@ -1,4 +1,4 @@
-// A library for bin.cu and bin.cuh: a pass of a stable radix sort, where only the device knows the number of items. It
+// A library for bin.cuh: a pass of a stable radix sort, where only the device knows the number of items. It
 // is "Onesweep" of Adinets and Merrill (2022): a block adds up what earlier blocks have published.
 #pragma once
 

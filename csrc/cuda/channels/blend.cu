@@ -1,4 +1,4 @@
-// Launches the forward kernel for any number of channels. dispatch.cu calls blend_channels().
+// Launches the forward kernel for any number of channels. forward.cu calls blend_channels().
 #include "cuda/channels/groups.cuh"
 
 namespace ar::cuda {

@@ -1,4 +1,4 @@
-// Launches the backward kernel for any number of channels. dispatch.cu calls blend_vjp_channels().
+// Launches the backward kernel for any number of channels. backward.cu calls blend_vjp_channels().
 #include "cuda/channels/groups_vjp.cuh"
 
 namespace ar::cuda {

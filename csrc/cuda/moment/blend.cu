@@ -1,4 +1,4 @@
-// Forward launches for footprints whose samples move; dispatch.cu calls blend_moment(). Where lists are cut into
+// Forward launches for footprints whose samples move; forward.cu calls blend_moment(). Where lists are cut into
 // segments (cut_lists.h), filter runs once. Then, for each group of channels, listed_blend takes the lists that are
 // cut, and moving_blend the others.
 #include "cuda/dispatch.h"

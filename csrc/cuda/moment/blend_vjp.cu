@@ -1,4 +1,4 @@
-// Backward launches for footprints whose samples move; dispatch.cu calls blend_vjp_moment(). Lists that are cut into
+// Backward launches for footprints whose samples move; backward.cu calls blend_vjp_moment(). Lists that are cut into
 // segments have the kernels segment_maps, chain_maps and segment_vjp. The others have moving_vjp. csrc/torch asks
 // max_group_sums() for the memory that segment_vjp needs.
 #include "cuda/dispatch.h"

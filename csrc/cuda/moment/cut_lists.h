@@ -1,6 +1,6 @@
 // Which lists of footprints whose samples move are cut into segments, which are worked on side by side. The rule is
-// moving_list_cut(). On the host, route_of() (dispatch.h) calls it. On the device, plan_chunks (bin.cu) writes the
-// segments into the chunk plan, where kernels read them as ListSegment.
+// moving_list_cut(). On the host, route_of() (dispatch.h) calls it. On the device, plan_chunks (bin/plan.cuh) writes
+// the segments into the chunk plan, where kernels read them as ListSegment.
 #pragma once
 
 #include <algorithm>

@@ -1,13 +1,12 @@
-// Three kernels of projection; project.cu launches them. `project` writes the splats of Gaussians, radii, rows of
+// Three kernels of projection; forward.cu launches them. `project` writes the splats of Gaussians, radii, rows of
 // channels, and what bin reads (keys, counts and tiles). `project_rows` writes public rows (mean, covariance, opacity,
 // depth, colour), to keep or to send to another rank. `shape_rows` reads public rows, and writes splats and what bin
 // reads.
 #pragma once
 
-#include "core/bin.h"
 #include "cuda/launch.cuh"
 #include "cuda/params.h"
-#include "cuda/project/sh_rows.cuh"
+#include "cuda/project/shared.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {
@@ -50,19 +49,6 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   }
   return found;
 }
-
-/// A camera that takes no registers. As bytes, because shared variables may not have initialisers.
-template <class Cam> struct SharedCamera {
-  alignas(16) char memory[sizeof(Cam)];
-
-  /// All threads of a block must call it.
-  __device__ const Cam& load(const CameraView<float>& view) {
-    Cam& camera = *reinterpret_cast<Cam*>(memory);
-    if (threadIdx.x == 0) camera = load_camera_as<Cam>(view);
-    __syncthreads();
-    return camera;
-  }
-};
 
 // Cam: Camera<float> or FullCamera<float>. A thread has a Gaussian; in `project` it may have several.
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {

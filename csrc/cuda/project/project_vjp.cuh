@@ -1,11 +1,12 @@
-// Kernels of the backward pass beside and after blend_vjp; project.cu launches them. project_vjp takes sums of pairs,
+// Kernels of the backward pass beside and after blend_vjp; backward.cu launches them. project_vjp takes sums of pairs,
 // or gradients of public rows, to gradients of Gaussians and, for each warp, of the camera. zero_culled_grads, beside
 // blend_vjp, reads only the ranges of pairs, and writes zeros for 32 adjacent Gaussians none of which has pairs. From
 // sums of pairs, row_grads writes gradients of public rows, and sum_channels of channels.
 #pragma once
 
 #include "cuda/launch.cuh"
-#include "cuda/project/project.cuh"
+#include "cuda/params.h"
+#include "cuda/project/shared.cuh"
 
 namespace ar::cuda {
 

@@ -1,4 +1,4 @@
-// Launches the forward kernels of footprints whose samples stay, for up to four channels. dispatch.cu calls
+// Launches the forward kernels of footprints whose samples stay, for up to four channels. forward.cu calls
 // blend_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"

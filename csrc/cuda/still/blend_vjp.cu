@@ -1,4 +1,4 @@
-// Launches the backward kernel of footprints whose samples stay, for up to four channels. dispatch.cu calls
+// Launches the backward kernel of footprints whose samples stay, for up to four channels. backward.cu calls
 // blend_vjp_still().
 #include "cuda/dispatch.h"
 #include "cuda/still/vjp.cuh"

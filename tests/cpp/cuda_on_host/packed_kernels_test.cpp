@@ -5,6 +5,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include "cuda/project/project.cuh"
 #include "cuda/project/project_vjp.cuh"
 
 namespace ar::cuda {

@@ -1,10 +1,29 @@
-// A library for project.cuh and project_vjp.cuh: coefficients of harmonics between memory and a warp's shared memory.
+// What the blocks of projection keep in shared memory, forward and backward: the camera, and a row of coefficients of
+// harmonics for each Gaussian of a warp. And how these kernels are launched.
 #pragma once
 
+#include <algorithm>
+
+#include "core/camera.h"
 #include "core/sh.h"
+#include "cuda/launch.cuh"
+#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
+
+/// A camera that takes no registers. As bytes, because shared variables may not have initialisers.
+template <class Cam> struct SharedCamera {
+  alignas(16) char memory[sizeof(Cam)];
+
+  /// All threads of a block must call it.
+  __device__ const Cam& load(const CameraView<float>& view) {
+    Cam& camera = *reinterpret_cast<Cam*>(memory);
+    if (threadIdx.x == 0) camera = load_camera_as<Cam>(view);
+    __syncthreads();
+    return camera;
+  }
+};
 
 /// Coefficients up to kDegree, a row per lane. Rows have an odd number of quads, 13 or 19, so that lanes access
 /// different banks.
@@ -83,5 +102,17 @@ template <int kDegree> struct ShRows {
     }
   }
 };
+
+/// A thread for each of n rows, in at most `most_blocks` blocks.
+template <class Params>
+void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream, unsigned most_blocks = ~0u) {
+  if (n > 0) launch(kernel, {std::min(blocks_of(n, kProjectThreads), most_blocks), kProjectThreads}, stream, p);
+}
+/// By the kind of camera.
+template <class Params>
+void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream,
+                 unsigned most_blocks = ~0u) {
+  launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream, most_blocks);
+}
 
 }  // namespace ar::cuda

@@ -1,12 +1,38 @@
-// Launches the kernels of bin.cuh, sort.cuh and plan.cuh for torch/backend_cuda.cpp. What they read and write is
-// declared in params.h.
+// The forward pass of CUDA, stage by stage in the order of Backend (torch/backend.h), and the kernels that each stage
+// launches. torch/backend_cuda.cpp allocates, fills the parameters of params.h, and calls these functions.
+//
+// | stage   | from, to                                             | kernels                                |
+// |---------|------------------------------------------------------|----------------------------------------|
+// | project | Gaussians to splats, or to public rows               | project/project.cuh                    |
+// | bin     | splats to the list of each tile, sorted by depth     | bin/bin.cuh, bin/sort.cuh              |
+// | blend   | lists to images: first a plan of the work, then one  | bin/plan.cuh; still/, moment/ or       |
+// |         | of three families of kernels                         | channels/, by the table of dispatch.h  |
+// | inspect | lists to statistics of pixels and Gaussians          | inspect.cuh                            |
+//
+// backward.cu has the adjoints.
 #include <algorithm>
 
 #include "cuda/bin/bin.cuh"
 #include "cuda/bin/plan.cuh"
-#include "cuda/launch.cuh"
+#include "cuda/dispatch.h"
+#include "cuda/inspect.cuh"
+#include "cuda/project/project.cuh"
 
 namespace ar::cuda {
+
+// project
+
+void project(const ProjectParams& p, cudaStream_t stream) {
+  launch_rows(project_kernel<Camera<float>>, project_kernel<FullCamera<float>>, p, stream,
+              multiprocessors() * kProjectBlocksPerSm);
+}
+void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
+  launch_rows(project_rows_kernel<Camera<float>>, project_rows_kernel<FullCamera<float>>, p, stream);
+}
+void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch_rows(shape_rows_kernel, p, p.n, stream); }
+
+// bin
+
 namespace {
 
 template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
@@ -30,19 +56,16 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
          p.tiles[digits.passes % 2], p.counts, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
+int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
+
 }  // namespace
 
 int64_t max_items() { return kMaxSortItems; }
-
-static int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
-
 int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(DepthScratch::words(n, kDepthPasses)); }
-
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
   const TileDigits digits(grid);
   return digits.with_bits([&](auto bits) { return aligned_bytes(SortScratch<bits>::words(capacity, digits.passes)); });
 }
-
 int tile_sort_result(TileGrid grid) { return TileDigits(grid).passes % 2; }
 
 void count_depths(const DepthSort& p, void* memory, ZeroedMemory other_scratch, ZeroedMemory of_tiles,
@@ -73,12 +96,37 @@ void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cud
   sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
 }
 
+// blend
+
+int multiprocessors_of_device() { return int(multiprocessors()); }
+
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
   const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
   const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
   launch(count_work_kernel, counters, stream, lists, grid.tiles(), cut, plan.state);
   launch(plan_kernel, shape, stream, lists, grid, samples, cut, layout, plan);
+}
+
+void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
+  const Family family = family_at(footprint, p.channels.count);
+  if (family == Family::kStill) blend_still(footprint, p, stream);
+  if (family == Family::kMoment) blend_moment(footprint, p, stream);
+  if (family == Family::kChannels) blend_channels(footprint, p, stream);
+}
+
+// inspect
+
+void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    with_tile_side<F>(p.grid, [&](auto side) {
+      const auto kernel = p.touched    ? inspect_kernel<F, side, Look::kStatistics>
+                          : p.dominant ? inspect_kernel<F, side, Look::kImages>
+                                       : inspect_kernel<F, side, Look::kMedian>;
+      launch(kernel, {unsigned(p.grid.tiles()), kInspectThreads<side>}, stream, p);
+    });
+  });
 }
 
 }  // namespace ar::cuda
