@@ -1,5 +1,5 @@
 # make demo: sets up what is needed and renders the demonstration.
-# make test: sets up what is needed and runs every test.
+# make test: sets up what is needed and runs every test; make test TESTS=tests/io: the Python tests of one folder.
 # make wheel: builds a wheel for the torch of VENV, and tries it in a fresh environment.
 # make docs: builds the site of the documents in build/site.
 # Set-up lives in a virtual environment, VENV. Nothing outside it is touched, except that on Debian as root
@@ -32,9 +32,15 @@ demo: $(VENV)/.installed
 # The C++ tests take the objects of the CPU path that the extension was linked from, where these are still there.
 EXTENSION_OBJECTS = $(shell $(BIN)/python -c \
   'import pathlib, sys; print(*pathlib.Path.cwd().glob(f"build/temp-{sys.implementation.cache_tag}/csrc/cpu"))')
+# TESTS=tests/io: the Python tests of a folder, and nothing else.
+TESTS ?=
 test: $(VENV)/.installed
+ifeq ($(TESTS),)
 	$(MAKE) test-cpp CORE_OBJECTS="$(EXTENSION_OBJECTS)"
 	$(MAKE) test-python test-simple-knn
+else
+	$(MAKE) test-python
+endif
 
 test-cpp: $(VENV)/.tools
 	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
@@ -62,7 +68,7 @@ test-sanitized: $(VENV)/.tools
 	cd $(BUILD)/sanitized && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
 
 test-python: $(VENV)/.installed
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q $(TESTS)
 
 # Built in place and not installed, so that a simple_knn that VENV may have stays what it is.
 test-simple-knn: $(VENV)/.installed
@@ -72,7 +78,7 @@ test-simple-knn: $(VENV)/.installed
 
 # The viewer in chromium and Firefox, which draw in software. Elsewhere than on Debian as root, CHROMIUM and FIREFOX name
 # the browsers. Tests of a browser that is missing are skipped, with the reason.
-BROWSER_TESTS ?= tests/test_viewer.py tests/test_viewer_live.py tests/test_viewer_webgpu.py tests/test_viewer_browser.py tests/test_viewer_firefox.py
+BROWSER_TESTS ?= tests/viewer
 BROWSER_PACKAGES := chromium firefox-esr xvfb libgl1-mesa-dri libegl1 libgl1
 test-browser: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable ".[test,test-browser]" || echo "no playwright: going on without"
@@ -89,7 +95,7 @@ fuzz: $(VENV)/.installed
 # Python tests of the extension built under the sanitizers, beside the usual one (docs/internals/testing.md): ten
 # minutes to build, ten to run. libasan must come first in a process; libstdc++ with it, or exceptions find no handler.
 SANITIZED := $(BUILD)/python-sanitized
-SANITIZED_TESTS ?= tests/test_api.py tests/test_determinism.py tests/test_process.py
+SANITIZED_TESTS ?= tests/api/test_api.py tests/kernels/test_determinism.py tests/api/test_process.py
 SANITIZED_SELECT ?= not exact and not memory and not instruction_sets and not another_process
 PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(CXX) -print-file-name=$(name)))
 test-python-sanitized: $(VENV)/.installed
@@ -113,7 +119,7 @@ bench: $(VENV)/.installed
 # For the torch of VENV, into the index of wheels in dist/, and tried in a fresh environment (wheels/build.py). With
 # WHEEL_PYTHON=python3, for the torch of that Python, into which nothing is installed: it needs no network.
 WHEEL_PYTHON ?=
-WHEEL_TESTS ?= tests/test_api.py tests/test_footprints.py
+WHEEL_TESTS ?= tests/api/test_api.py tests/kernels/test_footprints.py
 wheel: $(if $(WHEEL_PYTHON),,$(VENV)/.torch)
 	$(if $(WHEEL_PYTHON),,$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11 wheel pytest \
 	  pytest-xdist scipy mpmath hypothesis)

@@ -22,7 +22,7 @@ FOOTPRINTS = tuple(_VARIANTS)
 """Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
 
 # The footprints that the library means where nobody names one. No other module names a footprint
-# (tests/test_footprint_names.py); docs/footprints.md says why these are recommended.
+# (tests/project/test_footprint_names.py); docs/footprints.md says why these are recommended.
 PAPER = "analytic"  # the default, for parity with Analytic-Splatting
 PAPER_GRADIENT = f"{PAPER}:frame_gradient=paper"
 DILATED = "point"  # of 3DGS: what most repositories render with, and most files were trained with
@@ -42,7 +42,7 @@ ADVICE = {
     "speed": f"`{FASTEST}`",
     "parity with the paper": f"`{PAPER}`, the default",
 }
-"""Which footprint to take where. README.md, docs and messages have these words (tests/test_docs.py)."""
+"""Which footprint to take where. README.md, docs and messages have these words (tests/project/test_docs.py)."""
 ADVICE_IN_WORDS = "; ".join(f"{where}: {which}" for where, which in ADVICE.items()).replace("`", "")
 
 REFERENCE_FOOTPRINTS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["reference"])

@@ -19,7 +19,7 @@ import sys
 import torch
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / folder) for folder in (".", "makers", "kernels"))]
 
 import hard_cases  # noqa: E402
 import scenes  # noqa: E402

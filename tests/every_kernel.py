@@ -22,7 +22,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import scenes
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -32,6 +31,10 @@ from analytic_rasterizer.activations import activate
 from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.optim import FusedAdam
+
+sys.path[:0] = [str(Path(__file__).parent / folder) for folder in ("makers", "distributed")]
+
+import scenes  # noqa: E402
 
 
 class Image(NamedTuple):

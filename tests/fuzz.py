@@ -16,12 +16,16 @@ import argparse
 import math
 import sys
 import time
+from pathlib import Path
 
-import scenes
 import torch
-from scenes import VARIANTS, Camera, ParallelCamera, name_of, rand
 
 import analytic_rasterizer as ar
+
+sys.path.insert(0, str(Path(__file__).parent / "makers"))
+
+import scenes
+from scenes import VARIANTS, Camera, ParallelCamera, name_of, rand
 
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 # Zero, denormal and nearly so, huge; finite in float32.

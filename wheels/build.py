@@ -4,7 +4,7 @@
 
 makes OUT/*.tar.gz, the sources, and from them OUT/pt213cpu/analytic-rasterizer/*.whl (the folder is that of the pair of
 torch and CUDA), with the pages of the index. It then installs the wheel from the index into a fresh environment that
-sees the packages of this one, renders a picture there, and runs the given tests, such as tests/test_api.py.
+sees the packages of this one, renders a picture there, and runs the given tests, such as tests/api/test_api.py.
 
 Needs torch, pip, setuptools, ninja, pybind11 and wheel, for tests pytest, and no network. The environment variables of
 docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: the GPUs of this

@@ -18,8 +18,8 @@ from .arguments import Mode, Signal, Sizes
 
 _AT_ONCE = 3  # channels of harmonics that `project` evaluates
 # px^2, of a square pixel. The weight of every footprint but `point` and `mip` is an integral over the pixel, whatever
-# its samples. Around the mean its covariance is that of the Gaussian plus this (tests/test_gsplat.py measures it). Its
-# peak is below 1, which the radii leave out: they are bounds.
+# its samples. Around the mean its covariance is that of the Gaussian plus this (test_gsplat.py measures it). Its peak
+# is below 1, which the radii leave out: they are bounds.
 _PIXEL_VARIANCE = 1 / 12
 _CENTER = 0.5  # px, where gsplat has the centre of the first pixel
 _project, _composite = Op("project"), Op("composite")

@@ -1,4 +1,4 @@
-// Numbers of the rasterizer, by their names in csrc/core. tests/test_viewer.py compares them with the headers.
+// Numbers of the rasterizer, by their names in csrc/core. tests/viewer/test_viewer.py compares them with the headers.
 
 export const CONSTANTS = {
   kNear: 0.2,

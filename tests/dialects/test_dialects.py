@@ -40,7 +40,9 @@ pytestmark = pytest.mark.usefixtures("nothing_chosen")
 
 
 def test_every_dialect_is_listed():
-    assert set(dialects.DIALECTS) == set(ORIGINALS), "ORIGINALS of tests/originals.py must have a row for every dialect"
+    assert set(dialects.DIALECTS) == set(ORIGINALS), (
+        "ORIGINALS of tests/makers/originals.py must have a row for every dialect"
+    )
 
 
 @pytest.mark.parametrize("name", ORIGINALS)

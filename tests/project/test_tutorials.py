@@ -8,7 +8,7 @@ Four things differ from what a reader does:
 - trainings are short: `shortened` appends options to commands, and SHORTER replaces numbers in Python;
 - films have two frames (`shortened`);
 - `view` opens no browser: a thread loads the page instead, and presses Ctrl-C;
-- `pip` does not run: the folders and extras that it is given must exist. tests/test_packaging.py builds the package.
+- `pip` does not run: the folders and extras that it is given must exist. test_packaging.py builds the package.
 """
 
 import json

@@ -6,28 +6,30 @@ import math
 import pytest
 import scenes
 import torch
+from camera_reference import textbook
 from conftest import each_precision, run_python
-from reference import spherical_harmonics
-from test_gsplat import (
-    BOTH_LAYOUTS,
+from gsplat_calls import (
     HEIGHT,
     WIDTH,
     assert_gradients_close,
     cameras_of,
-    composited,
     drop_in,
     gradients,
+    render,
+    scene_of,
+    tolerance,
+)
+from reference import spherical_harmonics
+from test_gsplat import (
+    BOTH_LAYOUTS,
+    composited,
     patched,  # noqa: F401  (a fixture)
     projected,
     reference,  # noqa: F401  (a fixture)
-    render,
-    scene_of,
     step_once,
-    tolerance,
     trained,
 )
-from test_lens import textbook
-from test_stages import weighted_sums, weights
+from weights import weighted_sums, weights
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.dialects import gsplat as dialect

@@ -7,12 +7,12 @@ import pathlib
 import re
 
 import pytest
+from conftest import ROOT
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import advice, cli, footprints
 from analytic_rasterizer.training.options import TrainingOptions
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 DOCUMENTS = sorted(
     [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("simple_knn/*.md"), *ROOT.glob("third_party/*.md")]
 )

@@ -1,7 +1,7 @@
 """The hard cases as data, and how large an error each of them may have.
 
 A case is a scene that breaks textbook formulas, or a camera that does. docs/internals/testing.md has a row for
-each; tests/test_stability.py renders each with every footprint; benchmarks/stability.py measures.
+each; tests/kernels/test_stability.py renders each with every footprint; benchmarks/stability.py measures.
 
 Tolerances. The rasterizer promises to be as good as its inputs are exact: what it computes in a
 precision of unit roundoff eps is what exact arithmetic gives for inputs, and per-pixel terms, that are off
@@ -61,7 +61,7 @@ class Case:
     layers: int = 0  # splats of a stack: roundings that add up
     round: bool = False  # has splats of equal eigenvalues
     margin: float = 1e-3  # relative distance from a threshold within which rounding may decide
-    reference: bool = False  # also against tests/reference.py, in float64
+    reference: bool = False  # also against tests/makers/reference.py, in float64
     effects: Effects | None = None  # of a full camera, by all of which there are gradients too
 
 

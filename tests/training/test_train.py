@@ -35,6 +35,7 @@ from capture_files import (  # noqa: E402
     truth_gaussians,
     write_nerf_synthetic,
 )
+from runs import TINY, rows_shown, scatter  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
@@ -221,8 +222,6 @@ def test_help_of_train_says_what_values_are(capsys):
 
 # ------------------------------------------------------------------------------------ training
 
-TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
-
 
 def make_run(folder, out, device="cpu", resume=False, **options) -> training.Run:
     chosen = TrainingOptions(**{"iterations": 120, "scales": (1, 2), **TINY, **options})
@@ -256,23 +255,6 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
 
 
 @torch.no_grad()
-def scatter(gaussians) -> None:
-    """Puts Gaussians where no picture shows them, and others where only some pictures do."""
-    gaussians.means[::3, 1] += 50
-    gaussians.means[1::3] *= 4
-
-
-def rows_shown(trainer) -> list[torch.Tensor]:
-    """Which Gaussians each picture of the next step shows."""
-    supersampling = trainer.options.supersampling
-    with torch.no_grad():
-        return [
-            g.render(g.filtered(trainer.gaussians.arguments(), trainer.filter_3d), s.settings, None, supersampling)[1]
-            > 0
-            for s in trainer._next()
-        ]
-
-
 def state_of(trainer) -> list[torch.Tensor]:
     """Copies of parameters and moments, a row for each Gaussian."""
     moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in optim.MOMENTS]

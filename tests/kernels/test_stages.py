@@ -8,6 +8,7 @@ import scenes
 import torch
 from conftest import each_precision
 from scenes import Camera, name_of
+from weights import weighted_sums, weights
 
 import analytic_rasterizer as ar
 
@@ -35,16 +36,6 @@ def assert_gradients_close(actual, expected, dtype):
     for name in expected:
         error = (actual[name] - expected[name]).norm() / expected[name].norm().clamp_min(1e-30)
         assert error <= tolerances(dtype)[1], (name, error.item())
-
-
-def weights(shape, dtype, device, seed=0):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(device, dtype)
-
-
-def weighted_sums(images):
-    """A number of each image, to which every pixel adds with a factor of its own: gradcheck takes a backward pass for
-    each number that it is given, and a pixel whose gradient is wrong shows in the sum too."""
-    return tuple((image * weights(image.shape, torch.float64, "cpu", seed=k)).sum() for k, image in enumerate(images))
 
 
 @each_precision

@@ -21,7 +21,9 @@ import types
 from multiprocessing import forkserver
 from unittest import mock
 
-TESTS = pathlib.Path(__file__).resolve().parent
+TESTS = pathlib.Path(__file__).resolve().parent.parent
+FOLDERS = sorted({str(path.parent) for path in TESTS.glob("*/*.py")})
+"""Where code finds the tests and what they share."""
 DEADLINE = 900
 """Seconds after which something counts as hanging. Nothing takes a tenth of it on an idle machine: a busy one, which
 gives a test a small part of its time, must not look like one that hangs."""
@@ -106,7 +108,7 @@ def _interpret(program, arguments, environment, output):
     _take_environment(environment)
     os.chdir(TESTS)
     is_file = isinstance(program, pathlib.Path)
-    sys.path[:] = _search_path(str(program.parent) if is_file else "", environment)
+    sys.path[:] = _search_path([str(program.parent)] if is_file else ["", *FOLDERS], environment)
     sys.argv[:] = [str(program) if is_file else "-c", *arguments]
     if is_file:
         runpy.run_path(str(program), run_name="__main__")
@@ -124,14 +126,15 @@ def _take_environment(environment):
         sys.modules["torch"].set_num_threads(int(environment["OMP_NUM_THREADS"]))
 
 
-def _search_path(folder, environment):
-    """sys.path of a program in `folder`: without ROOT, whose package would come before the one that is to be tested."""
+def _search_path(own, environment):
+    """sys.path of a program with folders of its own: without ROOT, whose package would come before the one that is to
+    be tested."""
     given = [os.path.abspath(path) for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
     prefixes = sys.prefix, sys.base_prefix, *([site.USER_SITE] if site.USER_SITE else [])
     folders = tuple(os.path.join(prefix, "") for prefix in prefixes)  # with a separator at the end
-    own = str(TESTS.parent), str(TESTS)  # which lie below a prefix where the project is in /usr/src
+    project = str(TESTS.parent), str(TESTS), *FOLDERS  # which lie below a prefix where the project is in /usr/src
 
     def is_installed(path):
-        return path not in own and os.path.join(path, "").startswith(folders)
+        return path not in project and os.path.join(path, "").startswith(folders)
 
-    return [folder, *given, *filter(is_installed, sys.path)]
+    return [*own, *given, *filter(is_installed, sys.path)]

@@ -8,14 +8,15 @@ import datetime
 import random
 from itertools import pairwise
 
+import gsplat_calls
 import pytest
 import scenes
-import test_gsplat
 import torch
 import torch.distributed as dist
 from processes import DEADLINE, start_processes
 from scenes import Camera
 from test_distributed import COUNT, error_of, scene_of, with_camera_gradients
+from weights import weights as weights_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import distributed
@@ -127,16 +128,16 @@ def band_mistake(rank):
 
 def gaussians_of(variant):
     degree = VARIANTS[variant].get("sh_degree", 0)
-    scene = test_gsplat.scene_of(torch.float64, "cpu", degree, count=COUNT)
+    scene = gsplat_calls.scene_of(torch.float64, "cpu", degree, count=COUNT)
     if variant == "lens":
-        scene["extra_signals"] = test_gsplat.weights((COUNT, 4, 2), torch.float64, "cpu")
+        scene["extra_signals"] = weights_of((COUNT, 4, 2), torch.float64, "cpu")
     return scene
 
 
 def cameras_of(world, variant=None):
     """Those of all ranks."""
     eyes = [(0.3 + 0.4 * k, -0.2, -4.0 + 0.1 * k) for k in range(world * PER_RANK)]
-    cameras = test_gsplat.cameras_of(torch.float64, "cpu", 1)
+    cameras = gsplat_calls.cameras_of(torch.float64, "cpu", 1)
     views = torch.stack([Camera(eye=eye).world_to_camera() for eye in eyes])
     lenses = {}
     if variant == "lens":
@@ -151,7 +152,7 @@ def gsplat_of(variant, scene, cameras, options=None):
     with_color = "RGB" in options.get("render_mode", "RGB")
     backgrounds = torch.linspace(0.1, 0.9, 3, dtype=torch.float64).expand(len(cameras["Ks"]), 3) if with_color else None
     images, alphas, meta = rasterization(
-        **leaves, width=test_gsplat.WIDTH, height=test_gsplat.HEIGHT, backgrounds=backgrounds, **options
+        **leaves, width=gsplat_calls.WIDTH, height=gsplat_calls.HEIGHT, backgrounds=backgrounds, **options
     )
     meta["means2d"].retain_grad()
     weight = weights(*images.shape[1:3]).double()
@@ -174,7 +175,7 @@ def gsplat_mistakes(rank):
 
     def call(of_rank_1, cameras=own):
         changed = of_rank_1 if rank == 1 else {}
-        given = scene | cameras | {"width": test_gsplat.WIDTH, "height": test_gsplat.HEIGHT, "distributed": True}
+        given = scene | cameras | {"width": gsplat_calls.WIDTH, "height": gsplat_calls.HEIGHT, "distributed": True}
         return error_of(lambda: rasterization(**given | changed))
 
     return {
@@ -346,7 +347,7 @@ def test_gsplats_ranks_make_what_one_process_makes(made, world, variant):
         whole_of_ranks = torch.cat([part["gradients"][name] for part in parts])
         if name in ("viewmats", "Ks", "radial_coeffs"):
             error = (whole_of_ranks - whole).norm()
-            assert error <= test_gsplat.gradient_tolerance(torch.float64) * whole.norm() and whole.norm() > 0
+            assert error <= gsplat_calls.gradient_tolerance(torch.float64) * whole.norm() and whole.norm() > 0
         else:
             assert torch.equal(whole_of_ranks, whole), name
 

@@ -2,19 +2,18 @@
 
 import importlib.util
 import logging
-import pathlib
 import re
 import shutil
 import subprocess
 import sys
 
 import pytest
+from conftest import ROOT
 
 pytest.importorskip("mkdocs", reason="the site is built with mkdocs: make docs")
 for name in ("material", "mkdocstrings_handlers"):
     pytest.importorskip(name, reason=f"the site needs {name}: make docs")
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 spec = importlib.util.spec_from_file_location("site_hooks", DOCS / "site" / "hooks.py")
 hooks = importlib.util.module_from_spec(spec)

@@ -8,14 +8,13 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import pytest
 import torch
+from conftest import ROOT
 
 import analytic_rasterizer as ar
 
-ROOT = Path(__file__).resolve().parent.parent
 MINOR = ".".join(torch.__version__.split(".")[:2])
 
 

@@ -1,17 +1,15 @@
 """The binding of the CUDA kernels to torch compiles, also where torch has no CUDA and there is no GPU."""
 
-import pathlib
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
+from conftest import ROOT
 from torch.utils import cpp_extension
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 NVCC = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
-
-
 SOURCES = sorted((ROOT / "csrc" / "torch").glob("*cuda*.cpp"))
 
 
@@ -30,7 +28,7 @@ def test_the_cuda_ops_compile(tmp_path):
     generated.parent.mkdir(parents=True)
     generated.touch()
     include = [str(ROOT / "csrc"), *cpp_extension.include_paths(), str(tmp_path / "include")]
-    include = [path for path in include if pathlib.Path(path).is_dir()]
+    include = [path for path in include if Path(path).is_dir()]
     # No code is made of it: what it says is all that is asked.
     command = [NVCC, "-std=c++20", "-Xcompiler", "-fsyntax-only", "-c", str(source), "-o", str(tmp_path / "unused.o")]
     command += [f"-I{path}" for path in include]

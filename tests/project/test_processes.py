@@ -73,7 +73,7 @@ def test_a_program_finds_what_is_installed_for_the_user_and_not_this_project(tmp
     user, standard = str(tmp_path / "user"), os.path.dirname(os.__file__)
     monkeypatch.setattr(site, "USER_SITE", user)
     monkeypatch.setattr(sys, "path", [str(processes.TESTS), str(processes.TESTS.parent), standard, user])
-    found = processes._search_path("here", {"PYTHONPATH": str(tmp_path / "given")})
+    found = processes._search_path(["here"], {"PYTHONPATH": str(tmp_path / "given")})
     assert found == ["here", str(tmp_path / "given"), standard, user]
 
 
@@ -82,8 +82,12 @@ def test_a_program_does_not_find_what_only_begins_like_a_prefix_or_is_the_projec
     root, standard = processes.TESTS.parent, os.path.dirname(os.__file__)
     monkeypatch.setattr(sys, "prefix", str(root.parent))
     like_it = f"{root.parent}-old"
-    monkeypatch.setattr(sys, "path", [str(root / "tests"), str(root), like_it, str(root.parent), standard])
-    assert processes._search_path("here", {}) == ["here", str(root.parent), standard]
+    monkeypatch.setattr(
+        sys,
+        "path",
+        [str(root / "tests" / "makers"), str(root / "tests"), str(root), like_it, str(root.parent), standard],
+    )
+    assert processes._search_path(["here"], {}) == ["here", str(root.parent), standard]
 
 
 def test_what_a_thread_raises_is_raised_when_all_have_ended():

@@ -6,7 +6,7 @@ import pytest
 import reference
 import scenes
 import torch
-from test_api import Calls
+from op_calls import Calls
 from test_lens import LENSES, SPHERE, each_lens, settings_of
 
 import analytic_rasterizer as ar

@@ -39,7 +39,7 @@ DEFAULT_OPTIONS = {
 def settled(footprint, options):
     """All options of a footprint. Skips the test where this file has no formula of it: it is somebody's own."""
     if footprint not in DEFAULT_OPTIONS:
-        pytest.skip(f"tests/reference.py has no formula of footprint {footprint!r}")
+        pytest.skip(f"tests/makers/reference.py has no formula of footprint {footprint!r}")
     return DEFAULT_OPTIONS[footprint] | options
 
 

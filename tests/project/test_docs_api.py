@@ -4,14 +4,13 @@ import ast
 import functools
 import importlib
 import inspect
-import pathlib
 import re
 
 import pytest
+from conftest import ROOT
 
 import analytic_rasterizer
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "analytic_rasterizer"
 
 

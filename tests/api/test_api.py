@@ -15,10 +15,10 @@ import scenes
 import torch
 import torch.utils._pytree
 from conftest import each_precision, run_python
+from op_calls import Calls
 from scenes import PATHS, RENDERED, Camera, name_of
 from torch._subclasses import FakeTensorMode
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, rasterizer
@@ -894,19 +894,6 @@ def test_debug_changes_no_bit(device):
 
 
 # --- torch.library -----------------------------------------------------------------------------
-
-
-class Calls(TorchDispatchMode):
-    """Records the arguments of the first call of every op of ours."""
-
-    def __init__(self):
-        super().__init__()
-        self.first = {}
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        if func.namespace == "analytic_rasterizer":
-            self.first.setdefault(func._schema.name.split("::")[1], (func, args))
-        return func(*args, **(kwargs or {}))
 
 
 def calls(variant, device, full):

@@ -14,7 +14,7 @@ import pytest
 import reference
 import scenes
 import torch
-from conftest import each_precision
+from conftest import ROOT, each_precision
 from hard_cases import CASES, EPS
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
@@ -23,7 +23,7 @@ from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, VARIANTS, Camer
 
 import analytic_rasterizer as ar
 
-DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
+DOCS = ROOT / "docs"
 every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
@@ -535,10 +535,10 @@ def test_the_document_has_every_case():
 
 @pytest.mark.parametrize("document", ["reliability.md", "internals/testing.md"])
 def test_a_document_names_tests_that_exist(document):
-    folder = pathlib.Path(__file__).parent
-    sources = "".join(path.read_text() for path in folder.glob("test_*.py"))
+    files = sorted((ROOT / "tests").rglob("test_*.py"))
+    sources = "".join(path.read_text() for path in files)
     names = set(re.findall(r"\btest_\w+", (DOCS / document).read_text()))
     assert names
     for name in names:
-        known = f"def {name}(" in sources or (folder / f"{name}.py").exists()
+        known = f"def {name}(" in sources or name in {path.stem for path in files}
         assert known, f"docs/{document} names {name}, which does not exist"

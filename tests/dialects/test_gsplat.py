@@ -8,89 +8,31 @@ import pytest
 import scenes
 import torch
 from conftest import each_precision, run_python
-from scenes import Camera, name_of
-from test_stages import weighted_sums, weights
+from gsplat_calls import (
+    FAR,
+    HEIGHT,
+    NEAR,
+    WIDTH,
+    assert_gradients_close,
+    cameras_of,
+    drop_in,
+    gradient_tolerance,
+    gradients,
+    render,
+    scene_of,
+    tolerance,
+)
+from scenes import name_of
 from torch.utils._python_dispatch import TorchDispatchMode
+from weights import weighted_sums, weights
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.dialects import gsplat as dialect
 from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.relocation import compute_relocation
 
-WIDTH, HEIGHT = 45, 37
-NEAR, FAR = 0.01, 1e10
 RENDERED = scenes.KINDS
 BOTH_LAYOUTS = pytest.mark.parametrize("packed", [False, True], ids=["dense", "packed"])
-
-
-def tolerance(dtype):
-    """Of an image. In float32 a splat moves by the rounding of adding and removing half a pixel, twice 2^-19 px at
-    45 px, which is 7e-6 of a weight with a standard deviation of 0.55 px; a pixel's weights add up to 1."""
-    return 1e-12 if dtype == torch.float64 else 2e-5
-
-
-def gradient_tolerance(dtype):
-    """Of the norm of a gradient: those of two orders of summation, through a covariance in between."""
-    return 1e-9 if dtype == torch.float64 else 2e-3
-
-
-def scene_of(dtype, device, degree=0, count=40, seed=1):
-    """In float64 any scene; in float32 one without an alpha so near to a threshold that rounding decides."""
-    make = scenes.random_scene if dtype == torch.float64 else scenes.smooth_scene
-    scene = scenes.cast(make(seed, count if dtype == torch.float64 else 6, degree), dtype, device)
-    return {
-        "means": scene["means3D"],
-        "quats": scene["rotations"],
-        "scales": scene["scales"],
-        "opacities": scene["opacities"][:, 0].contiguous(),
-        "colors": scene["shs"] if degree else scene["shs"][:, 0].abs().contiguous(),
-    }
-
-
-def cameras_of(dtype, device, count=2):
-    """viewmats and Ks, with a principal point beside the centre."""
-    eyes = [(0.3, -0.2, -4.0), (1.2, 0.5, -3.4), (-0.8, 0.1, -3.8)][:count]
-    viewmats = torch.stack([Camera(eye=eye).world_to_camera() for eye in eyes])
-    K = torch.tensor([[37.5, 0, 20.0], [0, 36.0, 19.5], [0, 0, 1]], dtype=torch.float64)
-    return {"viewmats": viewmats.to(device, dtype), "Ks": K.expand(count, 3, 3).to(device, dtype).contiguous()}
-
-
-def render(scene, cameras, **options):
-    return rasterization(**{**scene, **cameras, "width": WIDTH, "height": HEIGHT, **options})
-
-
-def drop_in(scene, view, K, degree, footprint, means2D=None, background=None, **effects):
-    """The same Gaussians in one camera by our own rasterizer."""
-    settings = ar.camera_settings(
-        view,
-        WIDTH,
-        HEIGHT,
-        *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-        sh_degree=degree or 0,
-        bg=background,
-        dtype=view.dtype,
-        effects=ar.Effects(camera_gradients=True, off_center=True, near=NEAR, far=FAR, **effects),
-        footprint=footprint,
-    )
-    colors = {"colors_precomp": scene["colors"]} if degree is None else {"shs": scene["colors"]}
-    return ar.GaussianRasterizer(settings)(
-        means3D=scene["means"],
-        means2D=means2D,
-        opacities=scene["opacities"],
-        scales=scene["scales"],
-        rotations=scene["quats"],
-        **colors,
-    )
-
-
-def assert_gradients_close(actual, expected, dtype):
-    for name in expected:
-        error = (actual[name] - expected[name]).norm() / expected[name].norm().clamp_min(1e-30)
-        assert error <= gradient_tolerance(dtype), (name, error.item())
-
-
-def gradients(value, inputs):
-    return dict(zip(inputs, torch.autograd.grad(value, list(inputs.values()))))
 
 
 # --- gsplat's own reference --------------------------------------------------------------------------

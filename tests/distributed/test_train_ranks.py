@@ -25,7 +25,7 @@ pytest.importorskip("scipy", reason="needs the train extra")
 pytest.importorskip("gsply", reason="needs the train extra")
 
 from capture_files import circle, opengl_pose, write_pictures  # noqa: E402
-from test_train import TINY, rows_shown, scatter  # noqa: E402
+from runs import TINY, rows_shown, scatter  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.cli import launch  # noqa: E402
