@@ -39,7 +39,7 @@ from scene_files import load_scene
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.affine import LIMIT, PIXEL_VARIANCE, affine_error
-from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors
+from analytic_rasterizer.analysis.reference import UNFILTERED, finite_decibels, image_errors
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.cameras.lens import WIDE, Lens
 from analytic_rasterizer.cameras.rotations import rotation_matrices
@@ -357,7 +357,7 @@ def weight_table(args: argparse.Namespace) -> list[dict]:
 def averaged(found: list[dict]) -> dict[str, float]:
     """PSNR [dB] of mean squares, and means of shares."""
     means = {name: sum(numbers[name] for numbers in found) / len(found) for name in found[0]}
-    return {k: v if k in SHARES else -10 * math.log10(max(v, 1e-30)) for k, v in means.items()}
+    return {k: v if k in SHARES else finite_decibels(v) for k, v in means.items()}
 
 
 def save_pictures(out: str | None, name: str, pictures: dict[str, torch.Tensor]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,10 +13,10 @@ from ..footprints import RECOMMENDED, Footprint
 from ..gaussians import Gaussians
 from ..render.rasterizer import GaussianRasterizer
 from . import tables
+from .reference import LARGEST_PSNR, finite_decibels
 
 REDUCTIONS = (1, 2, 4, 8)
 SMALLEST = 8  # px: smaller pictures say nothing
-LARGEST_PSNR = 300.0  # dB
 
 
 @dataclass(frozen=True)
@@ -98,12 +97,11 @@ def bake_gain(
             for kind, found in (("unbaked", unbaked), ("baked", picture(baked, framed, RECOMMENDED))):
                 errors[kind][i] += (found - truth).square().sum().item()
             counts[i] += truth.numel()
-    psnr = {kind: tuple(map(_psnr, of_kind, counts)) for kind, of_kind in errors.items()}
+    psnr = {
+        kind: tuple(finite_decibels(squares / count) for squares, count in zip(of_kind, counts))
+        for kind, of_kind in errors.items()
+    }
     return baked, BakeGain(str(footprint), reductions, **psnr)
-
-
-def _psnr(squares: float, count: int) -> float:
-    return min(LARGEST_PSNR, -10 * math.log10(max(squares / count, 1e-30)))
 
 
 def _decibels(value: float) -> str:

@@ -30,7 +30,7 @@ from ..footprints import (
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
 from . import tables, timing
-from .reference import RMSE_SHARE, Refined, image_errors, refine, supersampled
+from .reference import RMSE_SHARE, Refined, finite_decibels, image_errors, refine, supersampled
 
 BASE = FASTEST  # times on the CPU are ratios to this
 SECOND_ESTIMATE = SIXTEEN_SAMPLES  # another way to the reference's limit
@@ -384,8 +384,9 @@ def _plot(results: dict, at_scale: dict):
                 ax.annotate(text, place, (0, 7), textcoords="offset points", fontsize=8, ha="center")
         floor = next((row["blending_rmse"] for row in rows if row["blending_rmse"]), None)
         if floor:
-            ax.axhline(_psnr(floor), color="black", linewidth=0.9, linestyle=":", label="floor of one exact weight")
-        limit, top = _psnr(at_scale["reference"]["resolves_rmse_from"]), ax.get_ylim()[1]
+            label = "floor of one exact weight"
+            ax.axhline(finite_decibels(floor**2), color="black", linewidth=0.9, linestyle=":", label=label)
+        limit, top = finite_decibels(at_scale["reference"]["resolves_rmse_from"] ** 2), ax.get_ylim()[1]
         if limit < top:
             ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
         ax.set_xlabel(f"{title} [{unit}]")
@@ -406,7 +407,3 @@ def _families(rows: list[dict]) -> dict[str, list[dict]]:
         label = f"{spec.name}, S samples" if "samples" in dict(spec.options) else row["method"].partition("@")[0]
         families.setdefault(label + ", supersampled" * (row["supersampling"] > 1), []).append(row)
     return families
-
-
-def _psnr(rmse: float) -> float:
-    return -20 * math.log10(max(rmse, 1e-15))

@@ -16,6 +16,7 @@ from ..io import optional_import
 from ..render.rasterizer import GaussianRasterizer
 
 RMSE_SHARE = 0.1  # a reference is refined until it changes by at most this share of the smallest error
+LARGEST_PSNR = 300.0  # dB, of pictures that are the same
 MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is not refined
 MAX_PIXELS = 2**23  # of one render of unfiltered samples; more pixels are split over several renders
 
@@ -96,6 +97,16 @@ def refine(
             coarse = truth
 
 
+def decibels(mean_square: torch.Tensor) -> torch.Tensor:
+    """PSNR [dB] of a mean square error, for colours from 0 to 1; infinite where there is no error."""
+    return -10 * mean_square.log10()
+
+
+def finite_decibels(mean_square: float) -> float:
+    """`decibels` of a number, `LARGEST_PSNR` at most."""
+    return min(LARGEST_PSNR, decibels(torch.tensor(mean_square, dtype=torch.float64, device="cpu")).item())
+
+
 def image_errors(color: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
     """How far a picture is from the truth, over all channels of all pixels, for colours from 0 to 1, not clamped.
 
@@ -107,7 +118,7 @@ def image_errors(color: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
     mse = error.square().mean().item()
     size = error.abs()
     return {
-        "psnr": -10 * math.log10(max(mse, 1e-30)),
+        "psnr": finite_decibels(mse),
         "rmse": math.sqrt(mse),
         "bias": error.mean().item(),
         "p999": size.kthvalue(math.ceil(0.999 * size.numel())).values.item(),

@@ -5,5 +5,6 @@
 | `camera` | `View`, and settings from a pose and focal lengths |
 | `lens` | `Lens`: cameras that are no pinhole |
 | `rotations` | rotations and small matrices |
+| `focus`, `up` | what cameras look at, and which direction is up |
 | `path` | camera paths for films |
 """

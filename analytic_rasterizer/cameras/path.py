@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 
 from .camera import View
-from .rotations import rotation_matrices
+from .focus import focus, position  # noqa: F401  (names that this module had)
+from .rotations import quaternion, rotation_matrices
+from .up import level_up  # noqa: F401
 
 HIGHEST = math.radians(80)  # elevation of an orbit: above it the direction of up would turn with the camera
-CONVERGING = 0.05  # share of the views' directions across a common line, below which they do not converge
-SPREAD = 0.02  # variance of the horizontal edges' directions in their plane, below which they have one direction
-LEVEL = 0.1  # their variance out of this plane, in that in it, up to which cameras were held level
-IN_FRONT = 0.75  # share of the views that must have what they converge on in front of them
 
 
 def orbit(views: Sequence[View], center: Tensor, up: Tensor, frames: int) -> list[View]:
@@ -92,43 +90,6 @@ def through(views: Sequence[View], frames: int) -> list[View]:
     return found
 
 
-def focus(views: Sequence[View]) -> Tensor | None:
-    """(3,) the point nearest to the optical axes of the views, world units; None where they do not converge on one.
-
-    That is where a capture of an object has it. Cameras that look the same way, or outwards, converge on nothing.
-    """
-    directions = torch.stack([view.w2c[2, :3] for view in views])
-    places = torch.stack([position(view) for view in views])
-    across = torch.eye(3, dtype=torch.float64, device="cpu") - directions[:, :, None] * directions[:, None, :]
-    total = across.mean(0)
-    if torch.linalg.eigvalsh(total)[0] < CONVERGING:
-        return None
-    point = torch.linalg.solve(total, (across @ places[:, :, None]).mean(0)[:, 0])
-    in_front = ((point - places) * directions).sum(1) > 0
-    return point if in_front.double().mean() >= IN_FRONT else None
-
-
-def level_up(views: Sequence[View]) -> Tensor:
-    """(3,) unit vector that is up in the world, if photographers held their cameras level.
-
-    It is the direction across the horizontal edges of all pictures. Where all pictures were taken in one direction, or
-    cameras were turned, it is the mean of what is up in the pictures; that of the first where these cancel.
-    """
-    edges = torch.stack([view.w2c[0, :3] for view in views])
-    ups = -torch.stack([view.w2c[1, :3] for view in views])
-    mean = ups.mean(0)
-    up = mean if mean.norm() > 0.1 else ups[0]
-    values, vectors = torch.linalg.eigh(edges.T @ edges / len(views))
-    if values[1] > SPREAD and values[0] < LEVEL * values[1]:
-        up = vectors[:, 0] * torch.where(vectors[:, 0] @ up < 0, -1, 1)
-    return torch.nn.functional.normalize(up, dim=0)
-
-
-def position(view: View) -> Tensor:
-    """(3,) where the camera is, world units."""
-    return -view.w2c[:3, :3].T @ view.w2c[:3, 3]
-
-
 def looking_at(place: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """(4, 4) world to camera, float64, of a camera at `place` that has `target` in its centre; all (3,)."""
     forward = torch.nn.functional.normalize(target - place, dim=0)
@@ -137,21 +98,6 @@ def looking_at(place: Tensor, target: Tensor, up: Tensor) -> Tensor:
     w2c[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     w2c[:3, 3] = -w2c[:3, :3] @ place
     return w2c
-
-
-def quaternion(rotation: Tensor) -> Tensor:
-    """(4,) unit quaternion (w, x, y, z) of a rotation (3, 3), or of the rotation nearest to a rounded one.
-
-    Source: Bar-Itzhack, New Method for Extracting the Quaternion from a Rotation Matrix, JGCD 2000.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
-    rows = [
-        [a + e + i, h - f, c - g, d - b],
-        [h - f, a - e - i, b + d, c + g],
-        [c - g, b + d, e - a - i, f + h],
-        [d - b, c + g, f + h, i - a - e],
-    ]
-    return torch.linalg.eigh(torch.tensor(rows, dtype=torch.float64, device="cpu"))[1][:, -1]
 
 
 def _between(a: Tensor, b: Tensor, t: float) -> Tensor:

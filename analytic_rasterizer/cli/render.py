@@ -12,6 +12,8 @@ from .. import io, render_stages
 from ..analysis import tables
 from ..analysis.memory import check_sizes
 from ..cameras import path as camera_path
+from ..cameras.focus import focus
+from ..cameras.up import level_up
 from ..footprints import FOOTPRINTS, Footprint, resolve_footprint
 from ..gaussians import Gaussians
 from ..render.effects import Effects
@@ -133,10 +135,10 @@ def path_of(args, scene: Gaussians, views: list[io.View]) -> list[io.View]:
     frames = FRAMES if args.frames is None else args.frames
     if args.path == "views":
         return camera_path.through(views, frames)
-    center = camera_path.focus(views)
+    center = focus(views)
     if center is None:
         center, _ = extent(scene.to("cpu"))
-    return camera_path.orbit(views, center, camera_path.level_up(views), frames)
+    return camera_path.orbit(views, center, level_up(views), frames)
 
 
 class Renderer:

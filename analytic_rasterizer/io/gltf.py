@@ -17,7 +17,9 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+import torch
 
+from ..cameras.rotations import rotation_matrices
 from ..gaussians import SH_C0
 from .common import SceneError, naming, unreadable
 from .turning import quaternion_of, turned_harmonics, turned_quaternions
@@ -227,13 +229,9 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    rotation = rotation_matrices(torch.tensor([w, x, y, z], dtype=torch.float64, device="cpu"), unit=True).numpy()
     matrix = np.eye(4)
-    matrix[:3, :3] = np.array(rotation) * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
+    matrix[:3, :3] = rotation * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
     matrix[:3, 3] = node.get("translation", [0, 0, 0])
     return matrix
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from ..cameras.rotations import quaternion, rotation_matrices
 
 SAMPLES = 64  # directions, more than the 16 harmonics
 
 
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """The unit quaternion of a (3, 3) rotation, the nearest one where it is only nearly that (Bar-Itzhack)."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    upper = [
-        [a + e + i, h - f, c - g, d - b],
-        [0, a - e - i, b + d, c + g],
-        [0, 0, e - a - i, f + h],
-        [0, 0, 0, i - a - e],
-    ]
-    found = np.linalg.eigh(np.array(upper), UPLO="U")[1][:, -1]
-    return found * np.sign(found[np.abs(found).argmax()])  # one of both signs, always the same
+    """The unit quaternion of a (3, 3) rotation, the nearest one where it is only nearly that: always of one sign."""
+    found = quaternion(torch.from_numpy(rotation)).numpy()
+    return found * np.sign(found[np.abs(found).argmax()])
 
 
 def turned_quaternions(by: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -29,9 +25,7 @@ def turned_quaternions(by: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 def turned_harmonics(by: np.ndarray, shs: np.ndarray) -> np.ndarray:
     """Harmonics (N, K, 3) whose colour in a turned direction is that of `shs` in the direction before."""
-    w, x, y, z = by
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    rotation = rotation_matrices(torch.from_numpy(by), unit=True).numpy()
     directions = np.random.default_rng(0).normal(size=(SAMPLES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     wanted, basis = _basis(directions @ rotation), _basis(directions)

@@ -15,7 +15,7 @@ from ..cameras.camera import View
 from .common import SceneError, first_line, opened_picture
 from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, sphere_of
 from .pictures import PictureFiles
-from .writing import write_text
+from .writing import write_json, write_text
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
@@ -62,13 +62,25 @@ def save_views(path, views: list[View]) -> None:
     Raises:
         OSError: It cannot be written. An earlier file is then unchanged.
     """
-    entries = []
-    for view in views:
-        entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
-        entry |= {k: getattr(view, k) for k in ("cx", "cy", "offset") if getattr(view, k) is not None}
-        entry |= {} if view.lens is None else {"lens": lens_to_json(view.lens)}
-        entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
+    entries = [{"name": view.name, **_camera(view), "w2c": view.w2c.flatten().tolist()} for view in views]
     write_text(path, json.dumps(entries, indent=1) + "\n")
+
+
+def write_cameras(path, views: list[View]) -> None:
+    """Writes `views` to the file `path`, as 3DGS's cameras.json, which viewers read. Raises as `save_views`."""
+    entries = []
+    for i, view in enumerate(views):
+        c2w = torch.linalg.inv(view.w2c)
+        pose = {"position": c2w[:3, 3].tolist(), "rotation": c2w[:3, :3].tolist()}
+        entries.append({"id": i, "img_name": view.name, **pose, **_camera(view)})
+    write_json(path, entries)
+
+
+def _camera(view: View) -> dict[str, Any]:
+    """What is not the pose. Programs that do not know `offset` and `lens` leave them unread."""
+    entry = {key: getattr(view, key) for key in ("width", "height", "fx", "fy")}
+    entry |= {key: getattr(view, key) for key in ("cx", "cy", "offset") if getattr(view, key) is not None}
+    return entry if view.lens is None else entry | {"lens": lens_to_json(view.lens)}
 
 
 def _views(data, folder: Path, size) -> list[View]:

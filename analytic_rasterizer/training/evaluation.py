@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..analysis.reference import decibels
 from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
 from ..losses import counted, ssim
@@ -37,7 +38,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         target = target.to(image.dtype) / 255
     error = (image.clamp(0, 1) - target).square()
     mean_error = error.mean() if mask is None else error.sum() / (len(error) * mask.square().sum())
-    return -10 * mean_error.log10()
+    return decibels(mean_error)
 
 
 def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False) -> Perceptual:

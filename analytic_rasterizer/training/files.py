@@ -12,8 +12,8 @@ import torch
 from .. import io
 from ..gaussians import Gaussians
 from ..io.appearance import CAMERAS, OPTIONS, SCENE  # noqa: F401  (the names by which commands find them)
-from ..io.lenses import lens_to_json
-from ..io.writing import as_json, write_json, write_safely, write_text
+from ..io.views import write_cameras  # noqa: F401
+from ..io.writing import as_json, write_json, write_safely, write_text  # noqa: F401
 
 CHECKPOINT = "checkpoint.pt"
 MIP_SCENE = "point_cloud_mip.ply"
@@ -75,19 +75,6 @@ class Log:
 def write_scene(path: Path, scene: Gaussians, footprint: str, offset: tuple[float, float, float] | None = None) -> None:
     """The scene in a file that says for which footprint it is, and what positions are relative to, see `View`."""
     io.save_scene(path, scene, io.SceneMetadata(footprint=footprint, offset=offset))
-
-
-def write_cameras(path: Path, views: list[io.View]) -> None:
-    """3DGS's cameras.json, which viewers and `io.load_views` read."""
-    entries = []
-    for i, view in enumerate(views):
-        c2w = torch.linalg.inv(view.w2c)
-        entry = {"id": i, "img_name": view.name, "width": view.width, "height": view.height}
-        entry |= {"position": c2w[:3, 3].tolist(), "rotation": c2w[:3, :3].tolist(), "fx": view.fx, "fy": view.fy}
-        entry |= {key: getattr(view, key) for key in ("cx", "cy", "offset") if getattr(view, key) is not None}
-        entry |= {} if view.lens is None else {"lens": lens_to_json(view.lens)}  # which others do not read
-        entries.append(entry)
-    write_json(path, entries)
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:

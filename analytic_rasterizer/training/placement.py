@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..cameras.focus import nearest_to_lines
 from .extent import ROUNDING, places_of
 
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
@@ -80,9 +81,7 @@ def focus_of(views: list[io.View]) -> tuple[Tensor | None, float]:
     spread = centers.norm(dim=1).median().item()
     if spread <= ROUNDING * (1 + mean.abs().max().item()):
         return None, 1.0
-    # The distance of x from an axis is |across (x - center)|.
-    across = torch.eye(3, dtype=axes.dtype, device="cpu") - axes[:, :, None] * axes[:, None, :]
-    focus = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    focus = nearest_to_lines(centers, axes)
     depth = ((focus - centers) * axes).sum(1).median().item()
     if not spread / 2 < depth < FARTHEST_FOCUS * spread:
         return None, DEPTH_WITHOUT_FOCUS * spread

@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
-from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -21,10 +20,12 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..analysis.memory import free_memory as free_on
 from ..checks import check_value
 from ..distributed.ranks import Ranks
 
 GIB = 1 << 30
+UNKNOWN = 8 * GIB  # of the host, where the system does not tell what is free
 DEVICE, HOST, FILE = "device", "host", "file"
 DEVICE_SHARE, SHARDED_SHARE = 1 / 4, 1 / 16  # of the device's free memory, alone and with several processes
 HOST_SHARE = 1 / 2  # of the free memory of the host
@@ -80,36 +81,10 @@ class Bytes(NamedTuple):
 
 
 def free_memory(device: torch.device) -> Bytes:
-    """What is free, what torch keeps on the device for later included."""
-    host = _free_on_host()
-    if device.type != "cuda":
-        return Bytes(host, host)
-    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return Bytes(torch.cuda.mem_get_info(device)[0] + kept, host)
-
-
-def _free_on_host() -> int:
-    """What Linux can give without swapping, within the limit of a container; elsewhere half of all there is."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        try:
-            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-        except (AttributeError, OSError, ValueError):  # Windows
-            return 8 * GIB
-    for folder, limit, used in (
-        ("/sys/fs/cgroup", "memory.max", "memory.current"),
-        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
-    ):
-        try:
-            most, taken = (int((Path(folder) / name).read_text()) for name in (limit, used))
-            statistics = dict(line.split() for line in (Path(folder) / "memory.stat").read_text().splitlines())
-            cached = int(statistics.get("inactive_file", 0))  # files that were read, which give way
-            return max(0, min(free, most - taken + cached))
-        except (OSError, ValueError):  # another version, or "max"
-            continue
-    return free
+    """What is free, see analysis/memory.py."""
+    host = free_on("cpu")
+    host = UNKNOWN if host is None else host
+    return Bytes(free_on(device) if device.type == "cuda" else host, host)
 
 
 def limits_of(memory: PictureMemory, free: Bytes, device: torch.device) -> Bytes:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from .. import io
+from ..cameras.rotations import rotation_matrices
 from ..footprints import footprint_variants
 from ..gaussians import Gaussians
 from ..render.rasterizer import GaussianRasterizer
@@ -49,15 +50,8 @@ def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
         raise ValueError(f"fov must be between 0 and pi, got {fov}")
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise ValueError(f"width and height must be from 1 to {LARGEST_SIDE}, got {width} and {height}")
-    w, x, y, z = pose[3:] / pose[3:].norm()
     w2c = torch.eye(4, dtype=torch.float64, device="cpu")
-    w2c[:3, :3] = torch.stack(  # the rows are the axes of the camera
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
-            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
-            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
+    w2c[:3, :3] = rotation_matrices(pose[3:] / pose[3:].norm(), unit=True).T  # the rows are the axes of the camera
     w2c[:3, 3] = -w2c[:3, :3] @ pose[:3]
     focal = height / (2 * math.tan(fov / 2))
     return io.View("live", width, height, focal, focal, w2c)

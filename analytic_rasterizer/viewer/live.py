@@ -16,6 +16,7 @@ from dataclasses import replace
 import torch
 
 from .. import io
+from ..cameras.up import mean_up
 from ..footprints import Footprint, get_default_footprint, resolve_footprint
 from ..gaussians import Gaussians
 from .frames import (
@@ -29,7 +30,7 @@ from .frames import (
     take_snapshot,
 )
 from .guarded import start_viser
-from .packing import extent, mean_up, overview, upright
+from .packing import extent, overview, upright
 
 REST_AFTER = 0.2
 """Seconds without motion after which a camera rests."""
@@ -141,7 +142,7 @@ class LiveViewer:
         self.port = self._server.get_port()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("Gaussian splats")
-        self._server.scene.set_up_direction(tuple(mean_up(self.views)))
+        self._server.scene.set_up_direction(tuple(mean_up(self.views).tolist()))
         self._thread = threading.Thread(target=self._render_loop, name="LiveViewer", daemon=True)
         self._thread.start()
         self._server.on_client_connect(self._connect)
@@ -239,7 +240,7 @@ class LiveViewer:
         self._middle = middle.cpu()
         if not self._views_given:
             self.views = [overview(self._middle, self._radius, *upright(scene.to("cpu"), self._middle, self._radius))]
-            self._server.scene.set_up_direction(tuple(mean_up(self.views)))
+            self._server.scene.set_up_direction(tuple(mean_up(self.views).tolist()))
 
     def _connect(self, handle) -> None:
         client = _Client(handle, self)

@@ -10,6 +10,8 @@ from typing import Any
 import torch
 
 from .. import io
+from ..cameras.rotations import rotation_matrices
+from ..cameras.up import mean_up
 from ..footprints import (
     DILATED,
     FASTEST,
@@ -169,7 +171,7 @@ def pack_scene(
 
     center, radius = extent(scene)
     if views:
-        up = mean_up(views)
+        up = mean_up(views).tolist()
     else:
         axis, ahead, down = upright(scene, center, radius)
         views, up = [overview(center, radius, axis, ahead, down)], axis.tolist()
@@ -236,10 +238,8 @@ def upright(scene: Gaussians, center: torch.Tensor, radius: float) -> tuple[torc
     """
     step = max(1, len(scene.means) // 100_000)
     means, scales, opacities = scene.means[::step].double(), scene.scales[::step].double(), scene.opacities[::step]
-    w, x, y, z = _unit_quaternions(scene.rotations[::step]).double().unbind(1)
     # Rows y and z of the rotations: column k is what axis k of a Gaussian has of that direction.
-    of_y = torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
-    of_z = torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    _, of_y, of_z = rotation_matrices(_unit_quaternions(scene.rotations[::step]).double(), unit=True).unbind(1)
     thinnest = scales.argmin(dim=1, keepdim=True)
     small, middle, large = scales.sort(dim=1).values.unbind(1)
     near = (means - center).norm(dim=1) < 1.5 * radius
@@ -280,11 +280,3 @@ def _view_entry(view: io.View) -> dict:
     entry["lens"] = view.lens is not None  # the page has pinholes, and says so
     entry["cx"], entry["cy"] = view.middle
     return entry | {"w2c": view.w2c.flatten().tolist()}
-
-
-def mean_up(views: list[io.View]) -> list[float]:
-    """The mean direction that is up in the pictures; that of the first where they cancel."""
-    ups = torch.stack([-view.w2c[1, :3] for view in views])
-    mean = ups.mean(dim=0)
-    up = mean if mean.norm() > 0.1 else ups[0]
-    return (up / up.norm()).tolist()

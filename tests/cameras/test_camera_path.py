@@ -9,8 +9,10 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
-from analytic_rasterizer.cameras.path import focus, level_up, looking_at, orbit, position, quaternion, through
-from analytic_rasterizer.cameras.rotations import rotation_matrices
+from analytic_rasterizer.cameras.focus import focus, position
+from analytic_rasterizer.cameras.path import looking_at, orbit, through
+from analytic_rasterizer.cameras.rotations import quaternion, rotation_matrices
+from analytic_rasterizer.cameras.up import level_up
 from analytic_rasterizer.gaussians import Gaussians
 
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")

@@ -1,6 +1,7 @@
 """Where pictures live changes no bit of a training; limits hold; what does not fit is said before it is read."""
 
 import json
+import pathlib
 import threading
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ pytest.importorskip("scipy", reason="needs the train extra")
 from capture_files import circle, write_nerf_synthetic  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
+from analytic_rasterizer.analysis import memory as system  # noqa: E402
 from analytic_rasterizer.training import PictureMemory, TrainingOptions, photographs, pictures, schedule, store  # noqa: E402
 from analytic_rasterizer.training.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store  # noqa: E402
 
@@ -285,18 +287,28 @@ def test_limits(monkeypatch):
             memory.check(CPU)
     found = store.free_memory(CPU)
     assert 0 < found.host == found.device
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     numbers = {"mem_get_info": (100, 1000), "memory_reserved": 70, "memory_allocated": 50}
     for name, value in numbers.items():
         monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
     assert store.free_memory(cuda).device == 120
 
 
-def test_a_container_limits_what_is_free(monkeypatch):
+@pytest.mark.parametrize(
+    ("folder", "limit", "used"),
+    [
+        ("/sys/fs/cgroup", "memory.max", "memory.current"),
+        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ],
+    ids=["version 2", "version 1"],
+)
+def test_a_container_limits_what_is_free(monkeypatch, folder, limit, used):
+    """Files that were read count as used, and give way. Trainings and pictures of commands go by the same number."""
     files = {
         "/proc/meminfo": "MemTotal: 90 kB\nMemAvailable: 80 kB\n",
-        "/sys/fs/cgroup/memory.max": "50000",
-        "/sys/fs/cgroup/memory.current": "20000",
-        "/sys/fs/cgroup/memory.stat": "anon 3\ninactive_file 5000\n",
+        f"{folder}/{limit}": "50000",
+        f"{folder}/{used}": "20000",
+        f"{folder}/memory.stat": "anon 3\ninactive_file 5000\n",
     }
 
     def read(path):
@@ -304,10 +316,31 @@ def test_a_container_limits_what_is_free(monkeypatch):
             raise FileNotFoundError(path)
         return files[str(path)]
 
-    monkeypatch.setattr(store.Path, "read_text", read)
-    assert store.free_memory(CPU).host == 35000
-    files["/sys/fs/cgroup/memory.max"] = "max"
-    assert store.free_memory(CPU).host == 80 * 1024
+    monkeypatch.setattr(pathlib.Path, "read_text", read)
+
+    def free():
+        assert store.free_memory(CPU) == (system.free_memory("cpu"),) * 2
+        return system.free_memory("cpu")
+
+    assert free() == 35000
+    files[f"{folder}/{used}"] = "60000"  # files that give way are not all of it
+    assert free() == 0
+    del files[f"{folder}/memory.stat"]
+    files[f"{folder}/{used}"] = "20000"
+    assert free() == 30000
+    files[f"{folder}/{limit}"] = "max"
+    assert free() == 80 * 1024
+
+
+def test_where_the_system_does_not_tell_half_of_all_memory_is_free(monkeypatch):
+    def missing(path):
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(pathlib.Path, "read_text", missing)
+    monkeypatch.setattr(system.os, "sysconf", {"SC_PHYS_PAGES": 6, "SC_PAGE_SIZE": 1000}.get)
+    assert system.free_memory("cpu") == 3000 and store.free_memory(CPU) == (3000, 3000)
+    monkeypatch.delattr(system.os, "sysconf")
+    assert system.free_memory("cpu") is None and store.free_memory(CPU) == (store.UNKNOWN, store.UNKNOWN)
 
 
 # -------------------------------------------------------------------- what is said, and when
