@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import reference
 import torch
-from conftest import ROOT
+from cli_extra import image
+from places import ROOT
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.analysis import tables
@@ -17,9 +18,7 @@ sys.path.append(str(ROOT / "benchmarks"))
 import paper_errors
 from paper import errors
 
-pytest.importorskip("tqdm", reason="needs the analysis extra")
 pytest.importorskip("matplotlib", reason="needs the analysis extra")
-image = pytest.importorskip("PIL.Image", reason="needs the analysis extra")
 
 
 def erf_weight(offset, cov2d):

@@ -2,6 +2,7 @@
 
 import math
 
+import cli_extra  # noqa: F401
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,6 @@ from analytic_rasterizer import io
 from analytic_rasterizer.analysis import reference
 from analytic_rasterizer.gaussians import Gaussians
 
-pytest.importorskip("tqdm", reason="needs the cli extra")
 special = pytest.importorskip("scipy.special")
 
 FOCAL, DEPTH = 40.0, 4.0
@@ -67,9 +67,7 @@ def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch,
     sizes = []
     rasterizer = reference.GaussianRasterizer
     monkeypatch.setattr(
-        reference,
-        "GaussianRasterizer",
-        lambda s: sizes.append((s.image_width, s.image_height)) or rasterizer(s),
+        reference, "GaussianRasterizer", lambda s: sizes.append((s.image_width, s.image_height)) or rasterizer(s)
     )
     monkeypatch.setattr(reference, "MAX_PIXELS", (density**2 // pieces) * 96 * 64)
     parts = reference.supersampled(scene, view, density)

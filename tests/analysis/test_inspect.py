@@ -8,7 +8,7 @@ import pytest
 import reference
 import scenes
 import torch
-from conftest import SHARED
+from places import SHARED
 from scenes import Camera
 
 import analytic_rasterizer as ar

@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from cli_extra import image
+from places import SHARED
 
 import analytic_rasterizer as ar
 import demo
@@ -16,10 +17,8 @@ from analytic_rasterizer import cli, io
 from analytic_rasterizer.analysis import pareto, reference, tables, timing
 from analytic_rasterizer.gaussians import Gaussians
 
-pytest.importorskip("gsply", reason="needs the analysis extra")
 pytest.importorskip("torchmetrics", reason="needs the analysis extra")
 pytest.importorskip("matplotlib", reason="needs the analysis extra")
-image = pytest.importorskip("PIL.Image", reason="needs the analysis extra")
 
 METHODS = ["analytic", "mip", "box:samples=1", "box:samples=4", "point:dilation=0@2"]
 PAPER = demo.PAPER

@@ -5,8 +5,8 @@ import warnings
 import originals
 import pytest
 import torch
-from conftest import run_python
 from originals import ORIGINALS, scene_of, settings_of
+from processes import run_python
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, advice, dialects

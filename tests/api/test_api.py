@@ -14,8 +14,9 @@ import reference
 import scenes
 import torch
 import torch.utils._pytree
-from conftest import each_precision, run_python
+from marks import each_precision
 from op_calls import Calls
+from processes import run_python
 from scenes import PATHS, RENDERED, Camera, name_of
 from torch._subclasses import FakeTensorMode
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
@@ -609,14 +610,9 @@ WRONG_SHAPES = {
         ({"scales": t(21, 3)}, r"scales must .*got \(21, 3\)"),
     ],
     "rotations": [({"rotations": t(20, 3)}, r"rotations must .*got \(20, 3\)")],
-    "colors_precomp": [
-        ({"shs": None, "colors_precomp": t(20, 513)}, r"colors_precomp must .*got \(20, 513\)"),
-    ],
+    "colors_precomp": [({"shs": None, "colors_precomp": t(20, 513)}, r"colors_precomp must .*got \(20, 513\)")],
     "cov3D_precomp": [
-        (
-            {"scales": None, "rotations": None, "cov3D_precomp": t(20, 3, 3)},
-            r"cov3D_precomp must .*got \(20, 3, 3\)",
-        ),
+        ({"scales": None, "rotations": None, "cov3D_precomp": t(20, 3, 3)}, r"cov3D_precomp must .*got \(20, 3, 3\)")
     ],
     "which inputs": [
         ({"shs": None}, r"shs.*colors_precomp|colors_precomp.*shs"),

@@ -3,7 +3,7 @@ are refused with the way out."""
 
 import pytest
 import torch
-from conftest import needs_newer_compiler
+from marks import needs_newer_compiler
 from originals import CAMERA, COUNT, ORIGINALS, arguments_of, fields_of, scene_of
 
 import analytic_rasterizer as ar
@@ -142,10 +142,7 @@ CALLS = {
         lambda given: ar.apply_3d_filter(given["scales"], given["opacities"], given["width"]),
         lambda d: scene_of(d) | {"width": torch.rand(COUNT, device=d) / 9},
     ),
-    "visible": (
-        lambda given: [ar.GaussianRasterizer(settings_with(given)).markVisible(given["means3D"])],
-        with_camera,
-    ),
+    "visible": (lambda given: [ar.GaussianRasterizer(settings_with(given)).markVisible(given["means3D"])], with_camera),
 }
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 import scenes
 import torch
-from conftest import needs_newer_compiler
+from marks import needs_newer_compiler
 from torch._subclasses import FakeTensorMode
 
 import analytic_rasterizer as ar

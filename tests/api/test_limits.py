@@ -11,7 +11,7 @@ import sys
 import pytest
 import scenes
 import torch
-from conftest import run_python
+from processes import run_python
 from scenes import Camera
 
 import analytic_rasterizer as ar

@@ -4,7 +4,7 @@ import pathlib
 import pickle
 
 import pytest
-from conftest import run_python
+from processes import run_python
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _old_names

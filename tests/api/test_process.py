@@ -8,8 +8,8 @@ import threading
 import pytest
 import scenes
 import torch
-from conftest import in_threads, needs_cuda, run_python
-from processes import DEADLINE
+from marks import needs_cuda
+from processes import DEADLINE, in_threads, run_python
 from scenes import KINDS, PATHS, Camera, name_of
 
 import analytic_rasterizer as ar

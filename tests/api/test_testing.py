@@ -5,8 +5,7 @@ import os
 import numpy as np
 import pytest
 import torch
-from conftest import python_path
-from processes import run_program
+from processes import python_path, run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import testing

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from cli_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
@@ -14,8 +15,6 @@ from analytic_rasterizer.cameras.path import looking_at, orbit, through
 from analytic_rasterizer.cameras.rotations import quaternion, rotation_matrices
 from analytic_rasterizer.cameras.up import level_up
 from analytic_rasterizer.gaussians import Gaussians
-
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 UP = torch.tensor([0.1, -0.2, 1.0], dtype=torch.float64)
 CENTER = torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 from camera_reference import fold_of, reach_of
-from conftest import needs_cuda
+from marks import needs_cuda
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C

@@ -16,16 +16,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED, python_path
-from processes import DEADLINE, run_program
+from cli_extra import image
+from places import SHARED
+from processes import DEADLINE, python_path, run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.cli import arguments as arguments_of_commands
 from analytic_rasterizer.gaussians import Gaussians
-
-pytest.importorskip("gsply", reason="needs the cli extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 FOOTPRINT_ARGUMENTS = {
     "default": ([], {"footprint": "point"}),  # what a file wants that says nothing
@@ -121,10 +119,7 @@ def test_a_closed_stderr_changes_no_result(files, capsys, monkeypatch):
 
 
 def test_size_for_views_that_state_none(files):
-    frame = {
-        "file_path": "a",
-        "transform_matrix": torch.diag(torch.tensor([1, -1, -1, 1])).tolist(),
-    }
+    frame = {"file_path": "a", "transform_matrix": torch.diag(torch.tensor([1, -1, -1, 1])).tolist()}
     (files / "views.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": [frame]}))
     assert cli.main(arguments(files, "--size", "40", "30")) == 0
     assert image.open(files / "out" / "a.png").size == (40, 30)
@@ -173,11 +168,7 @@ end_header
         (lambda files: (files / "scene.ply").unlink(), [], "scene.ply: no such file"),
         (scene_text("ply\nformat"), [], "scene.ply: the PLY header has no end_header"),
         (scene_text("jpeg"), [], "scene.ply: not a PLY file"),
-        (
-            scene_text(PLY_OF_X),
-            [],
-            "scene.ply: missing vertex properties y, z, f_dc_0",
-        ),
+        (scene_text(PLY_OF_X), [], "scene.ply: missing vertex properties y, z, f_dc_0"),
         (lambda files: (files / "views.json").unlink(), [], "views.json: No such file"),
         (views_text("[]"), [], "views.json: the list of views must be a list with at least one"),
         (views_text("{"), [], "views.json: not valid JSON"),
@@ -194,11 +185,7 @@ end_header
         (None, ["--scales", "1/2"], "with commas between them, got 1/2"),
         (None, ["--scales", "1", "2"], "unrecognized arguments: 2; lists have commas and no spaces: 1,2,4"),
         (None, ["--scale", "0.5"], "use --scales, which takes reductions: 2 is half the size; got 0.5"),
-        (
-            None,
-            ["--scales", "1e-5"],
-            "6400000 x 4800000 px are too large, a side may have 1048576 px; larger numbers",
-        ),
+        (None, ["--scales", "1e-5"], "6400000 x 4800000 px are too large, a side may have 1048576 px; larger numbers"),
         (None, ["--scales", "1e-4"], "pictures of 640000 x 480000 px need 1.97e+04 GB, and "),
         (None, ["--background", "0", "0"], "must be black, white or three numbers from 0 to 1, as R,G,B, got 0 ("),
         (
@@ -238,15 +225,9 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
         (["bake", "{}/nosuch", "--out", "a.ply"], "nosuch: no such file or folder"),
         (["tables"], "tables has moved: in a clone of the repository, run python benchmarks/paper_tables.py"),
         (["tables", "360-stst", "--data", "{}"], "run python benchmarks/paper_tables.py"),
-        (
-            ["errors", "--out", "{}"],
-            "errors has moved: in a clone of the repository, run python benchmarks/paper_err",
-        ),
+        (["errors", "--out", "{}"], "errors has moved: in a clone of the repository, run python benchmarks/paper_err"),
         (["errors", "--help"], "run python benchmarks/paper_errors.py"),
-        (
-            ["view", "a.ply", "--footprint", "exact"],
-            "; with --server every footprint can be shown",
-        ),
+        (["view", "a.ply", "--footprint", "exact"], "; with --server every footprint can be shown"),
         (["view", "a.ply", "--export", ""], "--export must end in .html, got"),
     ],
 )
@@ -259,18 +240,9 @@ def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
     [
         (["trian", "SCENE"], "argument COMMAND: invalid choice: 'trian' (choose from"),
         (["trian", "SCENE"], "; did you mean train? (see python -m analytic_rasterizer --help)"),
-        (
-            ["--versoin"],
-            "unrecognized arguments: --versoin; did you mean --version? (see python -m",
-        ),
-        (
-            ["train", "SCENE", "--ouut", "DIR"],
-            "arguments: --ouut; did you mean --out? (see python -m",
-        ),
-        (
-            ["train", "SCENE", "--out", "DIR", "--max_gaussians=3"],
-            "; did you mean --max-gaussians? (see",
-        ),
+        (["--versoin"], "unrecognized arguments: --versoin; did you mean --version? (see python -m"),
+        (["train", "SCENE", "--ouut", "DIR"], "arguments: --ouut; did you mean --out? (see python -m"),
+        (["train", "SCENE", "--out", "DIR", "--max_gaussians=3"], "; did you mean --max-gaussians? (see"),
         (["train", "SCENE", "--out", "DIR", "--iter", "3"], "arguments: --iter; did you mean --iterations? (see"),
         (["train", "SCENE", "--out", "DIR", "--iter", "3"], "(see python -m analytic_rasterizer train --help)"),
         (
@@ -528,10 +500,7 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
             ["--scales", "1,2"],
             "argument --scales: must be a reduction, a positive number (2 is half the size), got 1,2",
         ),
-        (
-            ["--footprint", "point:dilation=0"],
-            "no dilation to bake: it was trained with point:dilation=0.0, ",
-        ),
+        (["--footprint", "point:dilation=0"], "no dilation to bake: it was trained with point:dilation=0.0, "),
         (["--views", "{}/none.json"], "none.json: No such file"),
     ],
 )

@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from capture_files import circle, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
+from train_extra import image
 
 from analytic_rasterizer import cli, io, render_stages
-
-pytest.importorskip("scipy", reason="needs the train extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-
-from capture_files import circle, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures  # noqa: E402
 
 QUIET = ["--lpips", "none", "--device", "cpu"]
 

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from conftest import in_threads, needs_cuda
+from marks import needs_cuda
 from originals import CAMERA, render, scene_of, settings_of
+from processes import in_threads
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.dialects import mip

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import pytest
 import scenes
 import torch
-from conftest import needs_cuda
+from marks import needs_cuda
 
 import diff_gaussian_rasterization as drop_in
 import diff_gaussian_rasterization_ms as mini

@@ -11,7 +11,7 @@ import sys
 import pytest
 import scenes
 import torch
-from conftest import ROOT, each_precision, in_threads, run_python
+from marks import each_precision
 from originals import (
     BASE,
     CAMERA,
@@ -27,6 +27,8 @@ from originals import (
     scene_of,
     settings_of,
 )
+from places import ROOT
+from processes import in_threads, run_python
 
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in

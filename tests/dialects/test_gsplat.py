@@ -7,7 +7,6 @@ import math
 import pytest
 import scenes
 import torch
-from conftest import each_precision, run_python
 from gsplat_calls import (
     FAR,
     HEIGHT,
@@ -22,6 +21,8 @@ from gsplat_calls import (
     scene_of,
     tolerance,
 )
+from marks import each_precision
+from processes import run_python
 from scenes import name_of
 from torch.utils._python_dispatch import TorchDispatchMode
 from weights import weighted_sums, weights

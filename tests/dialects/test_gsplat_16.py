@@ -7,7 +7,6 @@ import pytest
 import scenes
 import torch
 from camera_reference import textbook
-from conftest import each_precision, run_python
 from gsplat_calls import (
     HEIGHT,
     WIDTH,
@@ -19,6 +18,8 @@ from gsplat_calls import (
     scene_of,
     tolerance,
 )
+from marks import each_precision
+from processes import run_python
 from reference import spherical_harmonics
 from test_gsplat import (
     BOTH_LAYOUTS,

@@ -6,7 +6,8 @@ nerfstudio itself is tried by tests/with_nerfstudio.py, in an environment of its
 import re
 
 import pytest
-from conftest import ROOT, run_python
+from places import ROOT
+from processes import run_python
 
 import analytic_rasterizer as ar
 

@@ -12,7 +12,7 @@ import pytest
 import scenes
 import torch
 import torch.distributed as dist
-from conftest import needs_cuda
+from marks import needs_cuda
 from processes import DEADLINE, start_processes
 from scenes import Camera
 from torch.distributed import distributed_c10d

@@ -293,8 +293,7 @@ def test_one_process_has_one_band():
 
 @pytest.mark.parametrize("size", [(512, 512), (201, 150)], ids=["large", "small"])
 @pytest.mark.parametrize(
-    "footprint",
-    ["mip", "box:samples=4", "box:samples=16", *(f"moment:samples={cells}" for cells in (1, 4, 16))],
+    "footprint", ["mip", "box:samples=4", "box:samples=16", *(f"moment:samples={cells}" for cells in (1, 4, 16))]
 )
 def test_rows_of_tiles_that_splats_touch(footprint, size, device):
     """Whatever the size of tiles: every pair is in one of the rows, and a splat in those between its first and last."""

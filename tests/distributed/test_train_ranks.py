@@ -15,25 +15,19 @@ from unittest import mock
 import pytest
 import torch
 import torch.distributed as dist
-from conftest import in_threads, python_path
-from processes import DEADLINE, run_program, start_processes
+import train_extra  # noqa: F401
+from capture_files import circle, opengl_pose, write_pictures
+from processes import DEADLINE, in_threads, python_path, run_program, start_processes
+from runs import TINY, rows_shown, scatter
 from torch.distributed import distributed_c10d
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-pytest.importorskip("gsply", reason="needs the train extra")
-
-from capture_files import circle, opengl_pose, write_pictures  # noqa: E402
-from runs import TINY, rows_shown, scatter  # noqa: E402
-
-from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.cli import launch  # noqa: E402
-from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts  # noqa: E402
-from analytic_rasterizer.gaussians import Gaussians  # noqa: E402
-from analytic_rasterizer.optim import MOMENTS, FusedAdam  # noqa: E402
-from analytic_rasterizer.training import TrainingOptions, files, model, schedule  # noqa: E402
-from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
+from analytic_rasterizer import training
+from analytic_rasterizer.cli import launch
+from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts
+from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.optim import MOMENTS, FusedAdam
+from analytic_rasterizer.training import TrainingOptions, files, model, schedule
+from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer
 
 WORLD = 3
 STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and from 1 to 3

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cli_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
@@ -16,9 +17,6 @@ from analytic_rasterizer.cli.arguments import use_machine
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.io.models import CfgArgs, read_cfg_args
 from analytic_rasterizer.training.options import TrainingOptions
-
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-pytest.importorskip("gsply", reason="needs the cli extra")
 
 UNMARKED = "point:dilation=0.3"
 MIP = "mip:variance=0.1"

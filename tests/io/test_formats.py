@@ -14,13 +14,11 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from cli_extra import image
 from ply_files import CAMERA, CODES, FLAGS, TRIANGLES, Element, ply
 
 from analytic_rasterizer import Gaussians, io
 from analytic_rasterizer.io.ply import TYPES, read_header, read_rows
-
-pytest.importorskip("gsply", reason="needs the cli extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 
 def random_scene(count=40, degree=3):
@@ -546,10 +544,7 @@ def test_other_programs_read_an_spz_with_an_extension(tmp_path):
 @pytest.mark.parametrize(
     "metadata, lost",
     [
-        (
-            io.SceneMetadata(footprint="moment"),
-            r"the footprint \(give --footprint moment:samples=4 where",
-        ),
+        (io.SceneMetadata(footprint="moment"), r"the footprint \(give --footprint moment:samples=4 where"),
         (io.SceneMetadata(antialiased=True), r"the footprint \(give --footprint mip "),
         (io.SceneMetadata(footprint="point", offset=(1, 2, 3)), r"the offset \(1\.0, 2\.0, 3\.0\) of its positions"),
     ],

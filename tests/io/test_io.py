@@ -8,14 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from cli_extra import image
+from places import SHARED
 
 from analytic_rasterizer import io
 from analytic_rasterizer.gaussians import Gaussians
-
-gsply = pytest.importorskip("gsply", reason="needs the cli extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-
 
 # ------------------------------------------------------------------------------------- scenes
 
@@ -400,10 +397,7 @@ def without(entry, *keys):
         (TRANSFORMS | {"w": 7, "fl_x": 3, "frames": [FRAME | {"w": 120, "fl_x": 110}]}, "r_0"),
         (
             without(TRANSFORMS, "fl_x", "fl_y")
-            | {
-                "camera_angle_x": 2 * math.atan(120 / 2 / 110),
-                "camera_angle_y": 2 * math.atan(80 / 2 / 105),
-            },
+            | {"camera_angle_x": 2 * math.atan(120 / 2 / 110), "camera_angle_y": 2 * math.atan(80 / 2 / 105)},
             "r_0",
         ),
     ],

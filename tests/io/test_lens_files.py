@@ -177,10 +177,7 @@ def test_lenses_of_nerfstudio(tmp_path):
     [
         ({"camera_model": "FTHETA"}, "frame 0: camera_model must be one of SIMPLE_PINHOLE, .*, got 'FTHETA'"),
         ({"camera_model": "FOV", "k1": 1.0}, "frame 0: camera_model FOV is not one of nerfstudio's"),
-        (
-            {"camera_model": "EQUIRECTANGULAR", "k1": 1.0},
-            "frame 0: EQUIRECTANGULAR must have no coefficients, got k1",
-        ),
+        ({"camera_model": "EQUIRECTANGULAR", "k1": 1.0}, "frame 0: EQUIRECTANGULAR must have no coefficients, got k1"),
         (
             {"k4": 0.1},
             "frame 0: a lens of OPENCV must have no coefficients but k1, k2, k3, p1, p2, got k4 = 0.1; .* 8th power, "

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from conftest import ROOT
+from cli_extra import image
+from places import ROOT
 
 from analytic_rasterizer import Gaussians, io, viewer
 from analytic_rasterizer.analysis import tables
@@ -17,8 +18,6 @@ from analytic_rasterizer.io import writing
 from analytic_rasterizer.training import files
 
 resource = pytest.importorskip("resource", reason="needs limits of POSIX")
-pytest.importorskip("gsply", reason="needs the cli extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 BEFORE = b"what was there"
 

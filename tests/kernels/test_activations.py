@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import each_precision, needs_cuda
+from marks import each_precision, needs_cuda
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.activations import activate

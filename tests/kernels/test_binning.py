@@ -11,7 +11,7 @@ import pytest
 import reference
 import scenes
 import torch
-from conftest import each_precision
+from marks import each_precision
 from scenes import KINDS, PATHS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
@@ -90,10 +90,7 @@ def largest_alpha_per_tile(settings, scene, variant, size=ar.TILE, block=4):
     pixels = torch.stack([padded[1], padded[0]], -1).double()
     out = []
     for mean, cov, opacity in zip(
-        means.split(block),
-        cov2d.split(block),
-        scene["opacities"].double().split(block),
-        strict=True,
+        means.split(block), cov2d.split(block), scene["opacities"].double().split(block), strict=True
     ):
         weights = reference.sample_weights(pixels - mean[:, None, None], cov[:, None, None], footprint, **options).amax(
             0

@@ -15,7 +15,8 @@ import hard_cases
 import pytest
 import scenes
 import torch
-from conftest import in_threads, needs_cuda
+from marks import needs_cuda
+from processes import in_threads
 from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar

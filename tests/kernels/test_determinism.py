@@ -5,7 +5,8 @@ depend on the instruction set.
 import pytest
 import scenes
 import torch
-from conftest import each_precision, run_python
+from marks import each_precision
+from processes import run_python
 from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar

@@ -267,11 +267,7 @@ def test_debug_names_the_channel_that_is_not_finite(device, tmp_path, monkeypatc
     "colors, bg, message",
     [
         ((30, 0), (0,), r"colors_precomp must have shape \(P, C\) with P = 30 and C from 1 to 512, got \(30, 0\)"),
-        (
-            (30, 513),
-            (513,),
-            r"colors_precomp must have shape \(P, C\) .* C from 1 to 512, got \(30, 513\)",
-        ),
+        ((30, 513), (513,), r"colors_precomp must have shape \(P, C\) .* C from 1 to 512, got \(30, 513\)"),
         ((29, 4), (4,), r"colors_precomp must have shape \(P, C\) with P = 30 and C from 1 to 512, got \(29, 4\)"),
         ((30, 4), (3,), r"bg must have shape \(4,\) or \(1, 4\), got \(3,\)"),
         ((30, 3), (3, 29, 36), r"bg must have shape \(3, 29, 37\), got \(3, 29, 36\)"),

@@ -5,7 +5,7 @@ import math
 import pytest
 import scenes
 import torch
-from conftest import each_precision
+from marks import each_precision
 from scenes import Camera, ParallelCamera
 
 import analytic_rasterizer as ar

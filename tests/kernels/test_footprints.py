@@ -281,11 +281,7 @@ def test_analytic_mass(device, frame_gradient):
     mass = 2 * math.pi * torch.sqrt(reference.determinant(cov2d))
     expected = mass * (factors[0] * factors[1] * phase).sum(-1)
     weights = weight(
-        device,
-        lattice() - means[:, None],
-        cov2d[:, None],
-        footprint="analytic",
-        frame_gradient=frame_gradient,
+        device, lattice() - means[:, None], cov2d[:, None], footprint="analytic", frame_gradient=frame_gradient
     )
     assert ((weights.sum(-1) - expected).abs() / expected).max() < 1e-11
 
@@ -616,20 +612,12 @@ def test_empty_and_strided(device):
         (ValueError, r"offset must .*got \(\)", lambda f: f(t(), t(3))),
         (ValueError, r"must .*got", lambda f: f(t(5, 2), t(4, 3))),
         (TypeError, r"offset must .*got (torch.int64|Long)", lambda f: f(t(5, 2).long(), t(5, 3))),
-        (
-            TypeError,
-            r"must .*got (torch.float16|Half)",
-            lambda f: f(t(5, 2).half(), t(5, 3).half()),
-        ),
+        (TypeError, r"must .*got (torch.float16|Half)", lambda f: f(t(5, 2).half(), t(5, 3).half())),
         (TypeError, r"must .*got (torch.float64|Double)", lambda f: f(t(5, 2), t(5, 3).double())),
         (ValueError, r"device", lambda f: f(t(5, 2), t(5, 3).to("meta"))),
         (ValueError, r"footprint must .*'cubic'", lambda f: f(t(5, 2), t(5, 3), footprint="cubic")),
         (ValueError, r"samples must .*3", lambda f: f(t(5, 2), t(5, 3), footprint="box:samples=3")),
-        (
-            ValueError,
-            r"samples must .*3",
-            lambda f: f(t(5, 2), t(5, 3), footprint="box", samples=3),
-        ),
+        (ValueError, r"samples must .*3", lambda f: f(t(5, 2), t(5, 3), footprint="box", samples=3)),
         (
             ValueError,
             r"frame_gradient must .*'own'",
@@ -639,11 +627,7 @@ def test_empty_and_strided(device):
         (ValueError, r"variance must .*-1", lambda f: f(t(5, 2), t(5, 3), "mip", variance=-1.0)),
         (ValueError, r"variance must .*nan", lambda f: f(t(5, 2), t(5, 3), "mip:variance=nan")),
         (ValueError, r"samples", lambda f: f(t(5, 2), t(5, 3), "mip", samples=4)),
-        (
-            (TypeError, ValueError),
-            r"footprint must .*got 3",
-            lambda f: f(t(5, 2), t(5, 3), footprint=3),
-        ),
+        ((TypeError, ValueError), r"footprint must .*got 3", lambda f: f(t(5, 2), t(5, 3), footprint=3)),
     ],
 )
 def test_errors(error, pattern, call):

@@ -4,7 +4,8 @@ import functools
 
 import pytest
 import torch
-from conftest import each_precision, needs_cuda, run_python
+from marks import each_precision, needs_cuda
+from processes import run_python
 from torch.nn import functional
 
 import analytic_rasterizer as ar

@@ -6,7 +6,7 @@ import pytest
 import reference
 import scenes
 import torch
-from conftest import each_precision
+from marks import each_precision
 from scenes import Camera
 
 import analytic_rasterizer as ar

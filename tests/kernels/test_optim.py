@@ -5,7 +5,7 @@ import io
 
 import pytest
 import torch
-from conftest import needs_cuda, needs_newer_compiler
+from marks import needs_cuda, needs_newer_compiler
 from torch.optim import Adam
 
 import analytic_rasterizer as ar

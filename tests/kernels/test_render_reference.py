@@ -203,8 +203,7 @@ def test_scale_modifier_acts_on_scales_only(device, best):
     assert difference < (1e-12 if best == torch.float64 else IMAGE_TOLERANCE[best])
     fixed = scenes.cast(scenes.with_precomputed(scenes.random_scene(31)), best, device)
     assert torch.equal(
-        render(Camera(scale_modifier=1.7), fixed, ("mip", {}))[0],
-        render(Camera(), fixed, ("mip", {}))[0],
+        render(Camera(scale_modifier=1.7), fixed, ("mip", {}))[0], render(Camera(), fixed, ("mip", {}))[0]
     )
 
 

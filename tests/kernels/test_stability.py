@@ -14,11 +14,12 @@ import pytest
 import reference
 import scenes
 import torch
-from conftest import ROOT, each_precision
 from hard_cases import CASES, EPS
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from marks import each_precision
+from places import ROOT
 from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar

@@ -6,7 +6,7 @@ import weakref
 import pytest
 import scenes
 import torch
-from conftest import each_precision
+from marks import each_precision
 from scenes import Camera, name_of
 from weights import weighted_sums, weights
 

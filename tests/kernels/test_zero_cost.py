@@ -17,7 +17,7 @@ from typing import NamedTuple
 import pytest
 import scenes
 import torch
-from conftest import each_precision, needs_cuda
+from marks import each_precision, needs_cuda
 from scenes import PATHS, Camera, name_of
 
 import analytic_rasterizer as ar
@@ -207,7 +207,7 @@ OTHER_EFFECTS = {
     "sh_degree": lambda *_: {"sh_degree": 1},
 }
 OUTPUT_EFFECTS = {name: lambda *_, name=name: {name: True} for name in OUTPUTS} | {
-    "all_outputs": lambda *_: ALL_OUTPUTS,
+    "all_outputs": lambda *_: ALL_OUTPUTS
 }
 each_camera_effect = pytest.mark.parametrize("name", CAMERA_EFFECTS)
 

@@ -5,16 +5,13 @@ import math
 import struct
 
 import numpy as np
-import pytest
 import torch
+from cli_extra import image
 
 from analytic_rasterizer import io
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-
-from analytic_rasterizer.training import colmap  # noqa: E402
-from analytic_rasterizer.training import model as g  # noqa: E402
+from analytic_rasterizer.training import colmap
+from analytic_rasterizer.training import model as g
 
 
 def write_colmap(folder, views, points, colors, model=1, coefficients=None) -> None:

@@ -21,7 +21,8 @@ import types
 from multiprocessing import forkserver
 from unittest import mock
 
-TESTS = pathlib.Path(__file__).resolve().parent.parent
+from places import ROOT, TESTS
+
 FOLDERS = sorted({str(path.parent) for path in TESTS.glob("*/*.py")})
 """Where code finds the tests and what they share."""
 DEADLINE = 900
@@ -72,6 +73,39 @@ def run_program(program, *arguments, environment=None, timeout=DEADLINE):
             _end([process])
         output = [pathlib.Path(path).read_text() if os.path.exists(path) else "" for path in made]
     return subprocess.CompletedProcess([program, *arguments], process.exitcode, *output)
+
+
+def python_path():
+    """PYTHONPATH of processes that find what the tests find, in whatever folder they run: their own path, and ROOT."""
+    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    return os.pathsep.join([*given, str(ROOT)])
+
+
+def run_python(code, *arguments, **environment):
+    """Output of a process of its own that runs `code` among the tests; fails where it hangs."""
+    done = run_program(code, *arguments, environment=os.environ | {"PYTHONPATH": python_path()} | environment)
+    assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
+    return done.stdout
+
+
+def in_threads(count, work):
+    """Calls work(0) ... work(count - 1) side by side, waits for all, and raises what the first of them raised."""
+    errors = [None] * count
+
+    def guarded(i):
+        try:
+            work(i)
+        except BaseException as error:  # also what pytest raises for `fail` and `skip`
+            errors[i] = error
+
+    threads = [threading.Thread(target=guarded, args=(i,)) for i in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for error in errors:
+        if error is not None:
+            raise error
 
 
 def _start_server():

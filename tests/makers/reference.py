@@ -564,9 +564,7 @@ def render(
     opacities = opacities.reshape(-1)
 
     rows, columns = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64),
-        torch.arange(width, dtype=torch.float64),
-        indexing="ij",
+        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
     )
     pixels = torch.stack([columns, rows], -1)
     samples = settled(footprint, options).get("samples", 1)

@@ -19,8 +19,8 @@ import pytest
 import scenes
 import torch
 from capture_files import circle, write_nerf_synthetic
-from conftest import ROOT, python_path
-from processes import DEADLINE
+from places import ROOT
+from processes import DEADLINE, python_path
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, io, training

@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, python_path
+from places import ROOT
+from processes import python_path
 
 EXAMPLE = ROOT / "examples" / "ci"
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cli_extra import image
 
 import demo
 from analytic_rasterizer import cli, render_stages
 from analytic_rasterizer.analysis import reference
-
-pytest.importorskip("gsply", reason="needs the cli extra")
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 SIZE = (96, 64)
 

@@ -7,7 +7,7 @@ import inspect
 import re
 
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 import analytic_rasterizer
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 pytest.importorskip("mkdocs", reason="the site is built with mkdocs: make docs")
 for name in ("material", "mkdocstrings_handlers"):

@@ -7,7 +7,7 @@ import ast
 import re
 
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C

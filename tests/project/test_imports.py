@@ -3,7 +3,8 @@
 import ast
 from graphlib import TopologicalSorter
 
-from conftest import ROOT, run_python
+from places import ROOT
+from processes import run_python
 
 PACKAGE = ROOT / "analytic_rasterizer"
 OPTIONAL = ("matplotlib", "scipy", "PIL", "gsply", "torchmetrics")

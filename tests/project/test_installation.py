@@ -7,7 +7,7 @@ import warnings
 
 import pytest
 import torch
-from conftest import ROOT
+from places import ROOT
 from processes import run_program
 
 from analytic_rasterizer import _C, installation

@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 import torch
-from conftest import ROOT
+from places import ROOT
 
 import analytic_rasterizer as ar
 

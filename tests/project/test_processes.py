@@ -10,8 +10,8 @@ import time
 import processes
 import pytest
 import torch
-from conftest import in_threads
-from processes import run_program, start_processes
+from places import ROOT, TESTS
+from processes import in_threads, run_program, start_processes
 
 ASKED = os.environ.get("ANALYTIC_RASTERIZER_ASKED")  # when this module is imported
 
@@ -72,14 +72,14 @@ def test_no_process_is_left_where_a_program_hangs(monkeypatch):
 def test_a_program_finds_what_is_installed_for_the_user_and_not_this_project(tmp_path, monkeypatch):
     user, standard = str(tmp_path / "user"), os.path.dirname(os.__file__)
     monkeypatch.setattr(site, "USER_SITE", user)
-    monkeypatch.setattr(sys, "path", [str(processes.TESTS), str(processes.TESTS.parent), standard, user])
+    monkeypatch.setattr(sys, "path", [str(TESTS), str(ROOT), standard, user])
     found = processes._search_path(["here"], {"PYTHONPATH": str(tmp_path / "given")})
     assert found == ["here", str(tmp_path / "given"), standard, user]
 
 
 def test_a_program_does_not_find_what_only_begins_like_a_prefix_or_is_the_project(monkeypatch):
     """Also where the project lies below a prefix, as /usr/src does below that of Debian's Python."""
-    root, standard = processes.TESTS.parent, os.path.dirname(os.__file__)
+    root, standard = ROOT, os.path.dirname(os.__file__)
     monkeypatch.setattr(sys, "prefix", str(root.parent))
     like_it = f"{root.parent}-old"
     monkeypatch.setattr(

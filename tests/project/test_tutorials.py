@@ -17,21 +17,18 @@ import re
 import shlex
 import textwrap
 
+import capture_files as files
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, python_path
-from processes import run_program
+from places import ROOT
+from processes import python_path, run_program
+from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-for needed in ("gsply", "scipy", "torchmetrics"):
-    pytest.importorskip(needed, reason="needs the train extra")
-
-import capture_files as files  # noqa: E402
-
+pytest.importorskip("torchmetrics", reason="needs the train extra")
 TUTORIALS = ROOT / "docs" / "tutorials"
 CLONE = "path/to/analytic_rasterizer"
 SIZE = 40, 32

@@ -6,17 +6,13 @@ import warnings
 
 import pytest
 import torch
+import train_extra  # noqa: F401
+from capture_files import circle, write_nerf_synthetic
+from test_plan import cameras, write_wall
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-
-from capture_files import circle, write_nerf_synthetic  # noqa: E402
-from test_plan import cameras, write_wall  # noqa: E402
-
-from analytic_rasterizer import cli, io, training  # noqa: E402
-from analytic_rasterizer.distributed.ranks import Ranks  # noqa: E402
-from analytic_rasterizer.training import TrainingOptions, automatic, files, plan  # noqa: E402
+from analytic_rasterizer import cli, io, training
+from analytic_rasterizer.distributed.ranks import Ranks
+from analytic_rasterizer.training import TrainingOptions, automatic, files, plan
 
 TINY = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300, "density": "none"}
 WORDS = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]

@@ -11,17 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
-
-import analytic_rasterizer as ar
-from analytic_rasterizer import cli, io, render_stages
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-pytest.importorskip("gsply", reason="needs the train extra")
-
-from capture_files import (  # noqa: E402
+from capture_files import (
     circle,
     draw_picture,
     looking_at_origin,
@@ -31,19 +21,13 @@ from capture_files import (  # noqa: E402
     write_nerf_synthetic,
     write_pictures,
 )
+from places import SHARED
+from train_extra import image
 
-from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import (  # noqa: E402
-    captures,
-    colmap,
-    files,
-    photographs,
-    pictures,
-    placement,
-    run,
-    undistortion,
-)
-from analytic_rasterizer.training import model as g  # noqa: E402
+import analytic_rasterizer as ar
+from analytic_rasterizer import cli, io, render_stages, training
+from analytic_rasterizer.training import captures, colmap, files, photographs, pictures, placement, run, undistortion
+from analytic_rasterizer.training import model as g
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
 
@@ -668,10 +652,7 @@ FOUND = {
     ),
     "opencv without distortion": (lambda f: write(f, "OPENCV"), {"notes": ()}),
     "a camera per picture, of two sizes": (of_two_sizes, {"notes": EXACT % "perspective"}),
-    "wild distortion": (
-        lambda f: write(f, "OPENCV", [0.3, -59, 0, 0]),
-        {"notes": EXACT % "perspective"},
-    ),
+    "wild distortion": (lambda f: write(f, "OPENCV", [0.3, -59, 0, 0]), {"notes": EXACT % "perspective"}),
     "a fisheye": (lambda f: write(f, "OPENCV_FISHEYE", [0.01, 0, 0, 0]), {"notes": EXACT % "fisheye"}),
     "not finite distortion": (
         lambda f: write(f, "SIMPLE_RADIAL", [math.nan]),
@@ -741,10 +722,7 @@ FOUND = {
         lambda f: write(f, names=[f"{i}.jpg" for i in range(9)], files=[f"{i}.png" for i in range(9)]),
         {"notes": ()},
     ),
-    "pictures in folders": (
-        lambda f: write(f, names=[f"cam{i % 2}/{i // 2}.png" for i in range(9)]),
-        {"notes": ()},
-    ),
+    "pictures in folders": (lambda f: write(f, names=[f"cam{i % 2}/{i // 2}.png" for i in range(9)]), {"notes": ()}),
     "folders with backslashes": (
         lambda f: write(
             f,

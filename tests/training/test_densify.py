@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from conftest import needs_cuda
+from marks import needs_cuda
 
 from analytic_rasterizer import density, io
 from analytic_rasterizer.cameras.rotations import rotation_matrices

@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from places import ROOT
 
 import analytic_rasterizer as ar
 import train_loop
@@ -268,11 +268,7 @@ def wrong_arguments():
     yield {"gaussians": wrong}, ValueError, r"logit_opacities must have 4 rows on cpu, as the means, got shape \(3, 1\)"
     yield {"extra": {"features": other}}, ValueError, "features must be a parameter of the optimizer, or require no"
     yield {"extra": {"labels": [1, 2, 3, 4]}}, TypeError, "labels must be a tensor, got list"
-    yield (
-        {"extra": {"shs": torch.zeros(4)}},
-        ValueError,
-        "extra must not have the name of a field of Gaussians",
-    )
+    yield ({"extra": {"shs": torch.zeros(4)}}, ValueError, "extra must not have the name of a field of Gaussians")
 
 
 @pytest.mark.parametrize("number", range(12))
@@ -370,11 +366,7 @@ def test_gaussians_at_points(device):
     [
         ({"points": [[0.0, 0, 0]]}, TypeError, "points must be a tensor, got list"),
         ({"points": torch.zeros(5, 3, dtype=torch.int32)}, TypeError, "points must have a floating-point dtype"),
-        (
-            {"points": torch.zeros(1, 3), "colors": torch.zeros(1, 3)},
-            ValueError,
-            r"points must have shape \(N, 3\)",
-        ),
+        ({"points": torch.zeros(1, 3), "colors": torch.zeros(1, 3)}, ValueError, r"points must have shape \(N, 3\)"),
         ({"colors": torch.zeros(4, 3)}, ValueError, r"colors must have shape .* got \(4, 3\)"),
         ({"colors": torch.full((5, 3), 200, dtype=torch.uint8)}, TypeError, "colors must have a floating-point dtype"),
         ({"colors": torch.full((5, 3), 200.0)}, ValueError, r"colors must be in \[0, 1\], got 200 to 200"),

@@ -7,15 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from capture_files import circle, draw_picture, write_nerf_synthetic
+from cli_extra import image
+from training_step import check_next_step
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-
-from capture_files import circle, draw_picture, write_nerf_synthetic  # noqa: E402
-from training_step import check_next_step  # noqa: E402
-
-from analytic_rasterizer import cli, training  # noqa: E402
-from analytic_rasterizer.training import files  # noqa: E402
-from analytic_rasterizer.training.exposure import Exposures, best_exposure, corrected  # noqa: E402
+from analytic_rasterizer import cli, training
+from analytic_rasterizer.training import files
+from analytic_rasterizer.training.exposure import Exposures, best_exposure, corrected
 
 OP = torch.ops.analytic_rasterizer.correct_colors
 

@@ -6,8 +6,6 @@ import types
 import pytest
 import torch
 
-pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("gsply", reason="needs the train extra")
 functional = pytest.importorskip("torchmetrics.functional.image.lpips", reason="needs the train extra")
 metric = pytest.importorskip("torchmetrics.image.lpip", reason="needs the train extra")
 

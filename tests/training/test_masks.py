@@ -5,17 +5,13 @@ import json
 import numpy as np
 import pytest
 import torch
+from capture_files import circle, draw_picture, write_colmap
+from cli_extra import image
+from training_step import check_next_step
 
-from analytic_rasterizer import io
+from analytic_rasterizer import io, training
 from analytic_rasterizer.losses import l1_ssim
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-
-from capture_files import circle, draw_picture, write_colmap  # noqa: E402
-from training_step import check_next_step  # noqa: E402
-
-from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import files, photographs, pictures  # noqa: E402
+from analytic_rasterizer.training import files, photographs, pictures
 
 SIZE = (40, 36)
 POINTS = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5

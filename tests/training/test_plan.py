@@ -10,19 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from capture_files import looking_at_origin, quaternion, write_colmap_text
+from cli_extra import image
+from places import SHARED
 
 from analytic_rasterizer import Lens, cli, io
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-
-from capture_files import looking_at_origin, quaternion, write_colmap_text  # noqa: E402
-
-from analytic_rasterizer.training import automatic, colmap, evidence, plan  # noqa: E402
-from analytic_rasterizer.training.evidence import medians_of  # noqa: E402
-from analytic_rasterizer.training.options import as_words  # noqa: E402
-from analytic_rasterizer.training.photographs import Stored  # noqa: E402
-from analytic_rasterizer.training.plan import (  # noqa: E402
+from analytic_rasterizer.training import automatic, colmap, evidence, plan
+from analytic_rasterizer.training.evidence import medians_of
+from analytic_rasterizer.training.options import as_words
+from analytic_rasterizer.training.photographs import Stored
+from analytic_rasterizer.training.plan import (
     EXPOSURE,
     NO,
     NOT_KNOWN,

@@ -9,20 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import needs_cuda
+from capture_files import circle, write_nerf_synthetic
+from marks import needs_cuda
+from train_extra import image
 
-from analytic_rasterizer import cli, io
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-
-from capture_files import circle, write_nerf_synthetic  # noqa: E402
-
-from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.analysis import memory as system  # noqa: E402
-from analytic_rasterizer.training import PictureMemory, TrainingOptions, photographs, pictures, schedule, store  # noqa: E402
-from analytic_rasterizer.training.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store  # noqa: E402
+from analytic_rasterizer import cli, io, training
+from analytic_rasterizer.analysis import memory as system
+from analytic_rasterizer.training import PictureMemory, TrainingOptions, photographs, pictures, schedule, store
+from analytic_rasterizer.training.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store
 
 CPU = torch.device("cpu")
 PLENTY = Bytes(100 * GIB, 100 * GIB)

@@ -9,24 +9,20 @@ import sys
 from dataclasses import replace
 
 import pytest
+import torch
+from capture_files import circle, write_colmap, write_nerf_synthetic, write_pictures
+from places import ROOT
+from processes import run_python
+from train_extra import image
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-pytest.importorskip("gsply", reason="needs the train extra")
-
-import torch  # noqa: E402
-from capture_files import circle, write_colmap, write_nerf_synthetic, write_pictures  # noqa: E402
-from conftest import ROOT, run_python  # noqa: E402
-
-from analytic_rasterizer import io, training  # noqa: E402
-from analytic_rasterizer.training import TrainingOptions, captures, evaluate, files  # noqa: E402
-from analytic_rasterizer.training import model as g  # noqa: E402
+from analytic_rasterizer import io, training
+from analytic_rasterizer.training import TrainingOptions, captures, evaluate, files
+from analytic_rasterizer.training import model as g
 
 sys.path.append(str(ROOT / "benchmarks"))
-import paper_tables  # noqa: E402
-from paper import PUBLISHED, ROWS, TABLES, Number, Results, as_dict, markdown, run_table, text  # noqa: E402
-from paper.published import AVERAGE, FOUR_SCALES, parse  # noqa: E402
+import paper_tables
+from paper import PUBLISHED, ROWS, TABLES, Number, Results, as_dict, markdown, run_table, text
+from paper.published import AVERAGE, FOUR_SCALES, parse
 
 # ------------------------------------------------------------------------------- the paper's numbers
 

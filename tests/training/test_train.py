@@ -14,41 +14,24 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, needs_cuda
+from capture_files import circle, looking_at_origin, truth_gaussians, write_nerf_synthetic
+from marks import needs_cuda
+from places import ROOT
 from processes import DEADLINE
+from runs import TINY, rows_shown, scatter
+from train_extra import image
 from training_step import TOLERANCE, check_next_step
 
-from analytic_rasterizer import cli, io, optim
+from analytic_rasterizer import cli, io, optim, training
 from analytic_rasterizer.cameras.lens import Lens
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
-
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-pytest.importorskip("gsply", reason="needs the train extra")
-
-from capture_files import (  # noqa: E402
-    circle,
-    looking_at_origin,
-    truth_gaussians,
-    write_nerf_synthetic,
-)
-from runs import TINY, rows_shown, scatter  # noqa: E402
-
-from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
-from analytic_rasterizer.render.arguments import camera_arguments  # noqa: E402
-from analytic_rasterizer.training import (  # noqa: E402
-    TrainingOptions,
-    captures,
-    files,
-    pictures,
-    schedule,
-)
-from analytic_rasterizer.training import model as g  # noqa: E402
-from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
+from analytic_rasterizer.losses import l1_ssim, ssim
+from analytic_rasterizer.render.arguments import camera_arguments
+from analytic_rasterizer.training import TrainingOptions, captures, files, pictures, schedule
+from analytic_rasterizer.training import model as g
+from analytic_rasterizer.training.evaluation import evaluate, psnr
 
 # -------------------------------------------------------------------------------------- errors
 

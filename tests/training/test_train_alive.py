@@ -8,15 +8,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
+from train_extra import image
 
-image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-
-from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures  # noqa: E402
-
-from analytic_rasterizer import cli, io, training  # noqa: E402
-from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files  # noqa: E402
+from analytic_rasterizer import cli, io, training
+from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files
 
 QUICK = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 400}
 FAR = 1e5  # of a camera with a wrong pose

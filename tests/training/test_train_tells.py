@@ -6,13 +6,9 @@ import sys
 
 import pytest
 import torch
-from conftest import run_python
-
-pytest.importorskip("PIL.Image", reason="needs the train extra")
-pytest.importorskip("tqdm", reason="needs the train extra")
-pytest.importorskip("scipy", reason="needs the train extra")
-
+import train_extra  # noqa: F401
 from capture_files import circle, write_nerf_synthetic
+from processes import run_python
 
 from analytic_rasterizer import cli, io, training
 from analytic_rasterizer.density import GradientDensity
@@ -275,10 +271,7 @@ def test_rates_fall_after_steps_or_a_share():
     [
         (["--noise", 1], "--noise has no effect: it is for the density control mcmc, got absgrad"),
         (["--grow-share", 0.1, "--density", "3dgs"], "--grow-share has no effect: it is for the density control mcmc"),
-        (
-            ["--gradient", 1e-4, "--density", "mcmc"],
-            "--gradient has no effect: it is for the density controls",
-        ),
+        (["--gradient", 1e-4, "--density", "mcmc"], "--gradient has no effect: it is for the density controls"),
         (["--reset-every", 100, "--density", "none"], "--reset-every has no effect: it is for the density controls"),
         (["--prune-opacity", 0.1, "--density", "none"], "--prune-opacity has no effect: the density control none"),
         (["--densify-every", 10, "--densify-until", 0], "--densify-every has no effect: densify_until is 0"),

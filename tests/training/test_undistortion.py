@@ -3,15 +3,13 @@
 import math
 from dataclasses import replace
 
+import cli_extra  # noqa: F401
 import numpy as np
 import pytest
 import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-
-pytest.importorskip("PIL.Image", reason="needs the train extra")
-
 from analytic_rasterizer.training import undistortion
 
 EYE = torch.eye(4, dtype=torch.float64)

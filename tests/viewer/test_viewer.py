@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 from capture_files import circle, write_colmap, write_pictures
-from conftest import ROOT
 from pages import serve
+from places import ROOT
 from processes import DEADLINE
 
 import analytic_rasterizer as ar

@@ -26,7 +26,6 @@ from chromium import (
     wait_for_frame,
     wait_until_ready,
 )
-from conftest import SHARED
 from pages import (
     LARGEST,
     PATIENCE,
@@ -39,6 +38,7 @@ from pages import (
     serve,
     turned_view,
 )
+from places import SHARED
 
 import analytic_rasterizer as ar
 import demo
@@ -477,10 +477,7 @@ def test_the_camera_travels_between_views(browser):
 
 
 def test_two_fingers_zoom(browser):
-    with (
-        serve(random_scene(100), [facing()]) as server,
-        open_page(browser, server.url, has_touch=True) as page,
-    ):
+    with serve(random_scene(100), [facing()]) as server, open_page(browser, server.url, has_touch=True) as page:
         wait_for_frame(page)
         touch = page.context.new_cdp_session(page)
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import needs_cuda
+from marks import needs_cuda
 from processes import DEADLINE
 from test_viewer import make_scene, make_view
 

@@ -64,10 +64,7 @@ def small(view, size=96):
 @pytest.fixture(scope="module")
 def settled(browser):
     scene, view, background = random_scene(), small(turned_view()), (0.2, 0.3, 0.4)
-    with (
-        serve(scene, [view], background=background) as server,
-        open_gpu(browser, server, "&view=0&size=16x16") as page,
-    ):
+    with serve(scene, [view], background=background) as server, open_gpu(browser, server, "&view=0&size=16x16") as page:
         wait_until_ready(page)
         yield page, scene, view, background
 
@@ -163,10 +160,7 @@ def test_compact_scenes(browser, degree):
         assert torch.allclose(getattr(told, name), getattr(scene, name), atol=atol, rtol=1e-3), name
     turned = (told.rotations * torch.nn.functional.normalize(scene.rotations)).sum(1).abs()
     assert turned.min() > np.cos(0.003)  # radians of half of the angle
-    with (
-        serve(scene, [view], compact=True) as server,
-        open_gpu(browser, server, "&view=0&size=16x16") as page,
-    ):
+    with serve(scene, [view], compact=True) as server, open_gpu(browser, server, "&view=0&size=16x16") as page:
         wait_until_ready(page)
         picture = drawn(page, "moment:samples=4", view.width, view.height)
     assert_same(picture, rendered(told, view, "moment:samples=4"))
