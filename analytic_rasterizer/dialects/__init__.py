@@ -11,7 +11,7 @@ import os
 import pkgutil
 from types import ModuleType
 
-from . import _base
+from . import _registry
 
 ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_DIALECT"
 DEFAULT = "gs2023"
@@ -65,7 +65,7 @@ def set_dialect(name: str | None) -> None:
     global _chosen
     _chosen = _FROM_ENVIRONMENT if name is None else _dialect_named(name, "dialect")
     # Under 3DGS 2023 other dialects are inferred all the same.
-    _base.choose(None if get_dialect() == DEFAULT else _MODULES[_chosen].GaussianRasterizationSettings)
+    _registry.choose(None if get_dialect() == DEFAULT else _MODULES[_chosen].GaussianRasterizationSettings)
 
 
 def get_dialect() -> str:

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from .. import _C
 from ..checks import check_tensors
 from ..footprints import PAPER, Footprint, chosen_footprint, resolve_footprint
 from ..render.effects import Effects, Outputs
@@ -18,6 +17,7 @@ from ..render.rasterizer import GaussianRasterizer as LibraryRasterizer
 from ..render.settings import GaussianRasterizationSettings as LibrarySettings
 from ..render.stages import project
 from ._refused import refusal, refuse
+from ._registry import known_fields, meant_by_arguments, meant_by_settings, register
 
 FIELDS = LibrarySettings._fields
 """The settings of 3DGS 2023, in its order."""
@@ -27,18 +27,7 @@ ARGUMENTS = (
 """The arguments of forward of 3DGS 2023, in its order."""
 
 _resolved = lru_cache(maxsize=64)(resolve_footprint)
-_inferred_from: dict[str, type] = {}  # keyword of settings: the settings that have it
-_inferred_from_arguments: dict[str, type] = {}  # keyword of forward: the settings whose rasterizer has it
-_inferred_without: dict[str, type] = {}  # keyword of settings: the settings that lack it
-_known_fields = dict.fromkeys(FIELDS)  # of all dialects, in order
-_chosen: type | None = None  # settings of the dialect that was chosen for the process
 _companion_filter: str | None = None  # of a program that trains through another module of ours
-
-
-def choose(settings_class: type | None) -> None:
-    """Makes `GaussianRasterizationSettings` of 3DGS 2023, wherever it was imported, make those of another dialect."""
-    global _chosen
-    _chosen = settings_class
 
 
 def use_filter_of_companion(name: str) -> None:
@@ -102,17 +91,14 @@ class GaussianRasterizationSettings(LibrarySettings):
             for name in ("_fields", "_make", "__match_args__", *made._fields):
                 setattr(cls, name, vars(made)[name])
             cls.__signature__ = inspect.signature(made)
-            _known_fields.update(dict.fromkeys(made._fields))
-        _inferred_from.update(dict.fromkeys(stated.get("inferred_from", ()), cls))
-        _inferred_from_arguments.update(dict.fromkeys(stated.get("inferred_from_arguments", ()), cls))
-        _inferred_without.update(dict.fromkeys(stated.get("inferred_without", ()), cls))
+        register(cls)
 
     def __new__(
         cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any
     ):
         refuse(kwargs)
         if cls is GaussianRasterizationSettings:
-            cls = _class_of(len(args), kwargs)
+            cls = meant_by_settings(len(args), kwargs) or cls
         if len(args) > len(cls._fields):
             raise TypeError(
                 f"settings of dialect {cls.dialect} have {len(cls._fields)} fields, got {len(args)} by position: name "
@@ -192,9 +178,7 @@ class GaussianRasterizationSettings(LibrarySettings):
             TypeError: There is none, or its settings have other fields than these.
         """
         refuse(arguments)
-        names = ", ".join(arguments)
-        found = {_inferred_from_arguments.get(name) for name in arguments}
-        cls = found.pop() if len(found) == 1 else None
+        names, cls = ", ".join(arguments), meant_by_arguments(arguments)
         if cls is None:
             raise TypeError(
                 f"the rasterizer of dialect {self.dialect} does not take {names}: remove it, or choose the dialect of "
@@ -210,22 +194,6 @@ class GaussianRasterizationSettings(LibrarySettings):
         return made
 
 
-def _class_of(positional: int, keywords: dict[str, Any]) -> type:
-    """The settings that are meant by so many positional fields and these keywords."""
-    if _chosen is not None:
-        return _chosen
-    found = {_inferred_from[name] for name in keywords if name in _inferred_from}
-    if len(found) > 1:
-        names = sorted(f"{name} ({_inferred_from[name].dialect})" for name in keywords if name in _inferred_from)
-        raise TypeError(f"settings must be of one dialect, got {', '.join(names)}")
-    if found:
-        return found.pop()
-    for name, cls in _inferred_without.items():
-        if name not in keywords and positional <= FIELDS.index(name):
-            return cls
-    return GaussianRasterizationSettings
-
-
 def as_settings(settings: Any) -> LibrarySettings:
     """Settings themselves, or those that an object with attributes of their names stands for.
 
@@ -237,7 +205,7 @@ def as_settings(settings: Any) -> LibrarySettings:
     """
     if isinstance(settings, LibrarySettings):
         return settings
-    known = [*_known_fields, "footprint", "effects"]
+    known = [*known_fields(), "footprint", "effects"]
     return GaussianRasterizationSettings(**{n: getattr(settings, n) for n in known if hasattr(settings, n)})
 
 
@@ -316,16 +284,17 @@ def rasterize_gaussians(
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`; it returns what the dialect of the settings returns."""
     return render_by(
-        raster_settings, means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+        means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
     )
 
 
-def render_by(raster_settings: Any, *arguments: torch.Tensor | None, **further: torch.Tensor | None) -> tuple:
+def render_by(
+    means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings, **further
+) -> tuple:
     """Renders as settings of any kind say; what the functional forms of the dialects share.
 
     Args:
         raster_settings: Of a dialect, of the library, or what `as_settings` takes.
-        *arguments: `ARGUMENTS`, in that order.
         **further: What a dialect takes besides, or None.
 
     Raises:
@@ -333,63 +302,9 @@ def render_by(raster_settings: Any, *arguments: torch.Tensor | None, **further: 
     """
     settings = as_settings(raster_settings)
     further = {name: tensor for name, tensor in further.items() if tensor is not None}
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
     if isinstance(settings, GaussianRasterizationSettings):
         return settings.render(**dict(zip(ARGUMENTS, arguments)), **further)
     if further:
         raise TypeError(f"settings must be of a dialect that takes {', '.join(further)}, got those of the library")
     return render(settings, NOTHING, *arguments)
-
-
-def feature_rows(name: str, features: torch.Tensor) -> torch.Tensor:
-    """(P, K) of an argument (P, 1, K) or (P, K). Raises TypeError or ValueError, naming it, for anything else."""
-    check_tensors(None, **{name: features})
-    if features.dim() not in (2, 3):
-        raise ValueError(f"{name} must have shape (P, 1, K) or (P, K), got {tuple(features.shape)}")
-    return features.flatten(1)
-
-
-def with_channels(
-    settings: GaussianRasterizationSettings,
-    features: torch.Tensor,
-    means3D: torch.Tensor,
-    means2D: torch.Tensor | None,
-    opacities: torch.Tensor,
-    shs: torch.Tensor | None,
-    colors_precomp: torch.Tensor | None,
-    scales: torch.Tensor | None,
-    rotations: torch.Tensor | None,
-    cov3D_precomp: torch.Tensor | None,
-) -> tuple:
-    """Renders colours and features; the features lie on zero, not on the background.
-
-    One pass takes up to 509 channels beside the colours. More than that, such as the 512 of CLIP, take further passes.
-
-    Args:
-        settings: Whose outputs are made too.
-        features: (P, K) of at least 1 channel.
-        means3D to cov3D_precomp: As in `render`.
-
-    Returns:
-        Image of the features (K, H, W), and what the dialect returns besides: `values` of the settings.
-
-    Raises:
-        TypeError, ValueError: As `render`, or features have another shape.
-    """
-    gaussians = means3D, means2D, opacities
-    shape = scales, rotations, cov3D_precomp
-    most, further = _C.MAX_CHANNELS - 3, ()
-    if isinstance(features, torch.Tensor) and features.dim() == 2 and features.shape[1] > most:
-        features, *further = features.split(most, dim=1)
-    image, radii, *outputs = render(settings, settings.outputs, *gaussians, shs, colors_precomp, *shape, features)
-    color, *images = image.tensor_split((3,))
-    for channels in further:
-        on_zero = settings._replace(bg=color.new_zeros(channels.shape[1]))
-        images.append(render(on_zero, NOTHING, *gaussians, None, channels, *shape)[0])
-    of_features = torch.cat(images) if further else images[0]
-    return of_features, settings.values(color, radii, *outputs)
-
-
-def given(tensor: torch.Tensor | None) -> bool:
-    """Whether an input is there: 3DGS passes those that are not as None or as an empty tensor."""
-    missing = isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0
-    return tensor is not None and not missing

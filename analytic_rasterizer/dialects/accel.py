@@ -10,7 +10,8 @@ from ..checks import check_tensors
 from ..optim import SparseGaussianAdam
 from ..render.autocast import way_out_of, widened
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, given, render_by
+from ._base import forward_like
+from ._further import adds, function_that_adds, given
 from .gs2024 import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "rasterize_gaussians"]
@@ -23,26 +24,14 @@ class GaussianRasterizationSettings(Settings):
     repositories = ("3DGS accel", "DashGaussian")
     inferred_from_arguments = ("dc",)
 
-    def render(
-        self,
-        means3D,
-        means2D,
-        opacities,
-        dc=None,
-        shs=None,
-        colors_precomp=None,
-        scales=None,
-        rotations=None,
-        cov3D_precomp=None,
-        **further,
-    ) -> tuple:
+    @adds(dc="opacities")
+    def render(self, dc=None, **gaussians) -> tuple:
         """As 3DGS 2024, with the constant harmonics `dc` (P, 1, 3) apart from `shs` (P, M - 1, 3), the others."""
         if given(dc):
             check_tensors(None, dc=dc)
-            shs = _joined(dc, shs) if given(shs) else dc
-        return super().render(
-            means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
-        )
+            shs = gaussians.get("shs")
+            gaussians["shs"] = _joined(dc, shs) if given(shs) else dc
+        return super().render(**gaussians)
 
 
 def _joined(dc: torch.Tensor, shs: torch.Tensor) -> torch.Tensor:
@@ -64,10 +53,4 @@ class GaussianRasterizer(Rasterizer):
     forward = forward_like(GaussianRasterizationSettings.render)
 
 
-def rasterize_gaussians(
-    means3D, means2D, dc, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
-) -> tuple:
-    """The functional form of `GaussianRasterizer.forward`."""
-    return render_by(
-        raster_settings, means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp, dc=dc
-    )
+rasterize_gaussians = function_that_adds(__name__, dc="means2D")

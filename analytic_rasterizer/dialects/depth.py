@@ -10,7 +10,8 @@ from ..footprints import DILATED
 from ..render.effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, given, rasterize_gaussians
+from ._base import forward_like, rasterize_gaussians
+from ._further import adds, given
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -24,31 +25,19 @@ class GaussianRasterizationSettings(Settings):
     filter = DILATED
     outputs = Effects(depth=True)
 
-    def render(
-        self,
-        means3D,
-        means2D,
-        opacities,
-        shs=None,
-        colors_precomp=None,
-        scales=None,
-        rotations=None,
-        cov3D_precomp=None,
-        means2D_densify=None,
-        **further,
-    ) -> tuple:
+    @adds(means2D_densify="cov3D_precomp")
+    def render(self, means2D_densify=None, **gaussians) -> tuple:
         """As 3DGS 2023; `means2D_densify`, of the shape of means2D, receives the gradient that means2D receives."""
         if given(means2D_densify):
             check_tensors(None, means2D_densify=means2D_densify)
+            means2D = gaussians.get("means2D")
             if given(means2D) and means2D_densify.shape != means2D.shape:
                 raise ValueError(
                     f"means2D_densify must have the shape of means2D, {tuple(means2D.shape)}, got "
                     f"{tuple(means2D_densify.shape)}"
                 )
-            means2D = means2D + means2D_densify if given(means2D) else means2D_densify
-        return super().render(
-            means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
-        )
+            gaussians["means2D"] = means2D + means2D_densify if given(means2D) else means2D_densify
+        return super().render(**gaussians)
 
     def returned(self, color, radii, outputs):
         return color, radii, outputs.depth

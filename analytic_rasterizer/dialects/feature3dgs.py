@@ -7,7 +7,8 @@ from ..footprints import DILATED
 from ..render.effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import feature_rows, forward_like, render_by, with_channels
+from ._base import forward_like
+from ._further import adds, feature_rows, function_that_adds, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -21,24 +22,13 @@ class GaussianRasterizationSettings(Settings):
     filter = DILATED
     outputs = Effects(depth=True)
 
-    def render(
-        self,
-        means3D,
-        means2D,
-        opacities,
-        shs=None,
-        colors_precomp=None,
-        semantic_feature=None,
-        scales=None,
-        rotations=None,
-        cov3D_precomp=None,
-    ) -> tuple:
+    @adds(semantic_feature="colors_precomp")
+    def render(self, semantic_feature=None, **gaussians) -> tuple:
         """As 3DGS 2023; `semantic_feature` (P, 1, K), or (P, K), is blended on zero with the colours' weights."""
         if semantic_feature is None:
             raise ValueError("semantic_feature must be given in dialect feature3dgs, got None")
         rows = feature_rows("semantic_feature", semantic_feature)
-        arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
-        features, (color, radii, *further) = with_channels(self, rows, *arguments)
+        features, (color, radii, *further) = with_channels(self, rows, **gaussians)
         return color, features, radii, *further
 
     def returned(self, color, radii, outputs):
@@ -51,18 +41,4 @@ class GaussianRasterizer(Rasterizer):
     forward = forward_like(GaussianRasterizationSettings.render)
 
 
-def rasterize_gaussians(
-    means3D,
-    means2D,
-    sh,
-    colors_precomp,
-    semantic_feature,
-    opacities,
-    scales,
-    rotations,
-    cov3Ds_precomp,
-    raster_settings,
-) -> tuple:
-    """The functional form of `GaussianRasterizer.forward`."""
-    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
-    return render_by(raster_settings, *arguments, semantic_feature=semantic_feature)
+rasterize_gaussians = function_that_adds(__name__, semantic_feature="colors_precomp")

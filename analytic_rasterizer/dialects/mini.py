@@ -18,7 +18,8 @@ from ..render.outputs import depths
 from ..render.rasterizer import render
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, given, rasterize_gaussians
+from ._base import as_settings, rasterize_gaussians
+from ._further import given
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 

@@ -13,9 +13,10 @@ from ..checks import check_tensors
 from ..footprints import DILATED
 from ..render.autocast import widened
 from ..render.effects import Effects
-from ._base import FIELDS, forward_like, render_by
+from ._base import FIELDS, forward_like
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
+from ._further import adds, function_that_adds
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -55,20 +56,8 @@ class GaussianRasterizationSettings(Settings):
     filter = DILATED
     outputs = Effects(depth=True, alpha=True, gaussian_stats=True)
 
-    def render(
-        self,
-        means3D,
-        means2D,
-        opacities,
-        shs=None,
-        colors_precomp=None,
-        scales=None,
-        rotations=None,
-        cov3D_precomp=None,
-        theta=None,
-        rho=None,
-        **further,
-    ) -> tuple:
+    @adds(theta="cov3D_precomp", rho="theta")
+    def render(self, theta=None, rho=None, **gaussians) -> tuple:
         """As 3DGS 2023, with the camera's motion.
 
         Args:
@@ -78,9 +67,7 @@ class GaussianRasterizationSettings(Settings):
         settings = self
         if theta is not None or rho is not None:
             settings = self._moved(theta, rho)
-        return super(GaussianRasterizationSettings, settings).render(
-            means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
-        )
+        return super(GaussianRasterizationSettings, settings).render(**gaussians)
 
     def _moved(self, theta: torch.Tensor | None, rho: torch.Tensor | None) -> GaussianRasterizationSettings:
         """These settings with gradients to theta and rho.
@@ -109,19 +96,4 @@ class GaussianRasterizer(Rasterizer):
     forward = forward_like(GaussianRasterizationSettings.render)
 
 
-def rasterize_gaussians(
-    means3D,
-    means2D,
-    sh,
-    colors_precomp,
-    opacities,
-    scales,
-    rotations,
-    cov3Ds_precomp,
-    theta,
-    rho,
-    raster_settings,
-) -> tuple:
-    """The functional form of `GaussianRasterizer.forward`."""
-    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
-    return render_by(raster_settings, *arguments, theta=theta, rho=rho)
+rasterize_gaussians = function_that_adds(__name__, theta="cov3Ds_precomp", rho="theta")

@@ -72,11 +72,11 @@ def render(
     means3D: torch.Tensor,
     means2D: torch.Tensor | None,
     opacities: torch.Tensor,
-    shs: torch.Tensor | None,
-    colors_precomp: torch.Tensor | None,
-    scales: torch.Tensor | None,
-    rotations: torch.Tensor | None,
-    cov3D_precomp: torch.Tensor | None,
+    shs: torch.Tensor | None = None,
+    colors_precomp: torch.Tensor | None = None,
+    scales: torch.Tensor | None = None,
+    rotations: torch.Tensor | None = None,
+    cov3D_precomp: torch.Tensor | None = None,
     features: torch.Tensor | None = None,
 ) -> tuple:
     """Renders: (color, radii), and `Outputs` where `outputs` or the effects of the settings ask for some.
