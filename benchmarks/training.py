@@ -36,7 +36,8 @@ from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
 from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture
 from analytic_rasterizer.training.files import write_json
-from analytic_rasterizer.training.options import DOWNSAMPLINGS, PRESETS, preset_values
+from analytic_rasterizer.training.options import PRESETS, preset_values
+from analytic_rasterizer.training.parts import DOWNSAMPLINGS
 from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.start import background_of, starting_gaussians
 

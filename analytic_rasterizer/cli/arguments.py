@@ -39,6 +39,9 @@ class Parser(argparse.ArgumentParser):
 
     It takes no option by a part of its name: programs that call a command would break with the next option that begins
     so. The error for an unknown name says which is near.
+
+    Args:
+        others: As of ArgumentParser, but for `allow_abbrev`.
     """
 
     def __init__(self, **others):

@@ -15,7 +15,7 @@ from ..training.captures import CHOICES, IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
-from ..training.options import check_scales
+from ..training.parts import check_scales
 from ..training.start import background_of
 from ..training.store import processes_here
 from .arguments import (

@@ -3,87 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 import re
 import sys
-import typing
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 
 from .. import io
+from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
-from ..training.options import (
-    BACKGROUNDS,
-    DENSITIES,
-    DOWNSAMPLINGS,
-    PRESETS,
-    RANDOM_BACKGROUND,
-    TIMES,
-    flag,
-    preset_values,
-)
+from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
 from ..training.reports import process_age
-from .arguments import add_machine_options, port, use_expandable_segments, use_machine, whole_numbers
+from .arguments import METAVARS, add_machine_options, port, use_expandable_segments, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
 
-METAVARS = {
-    **dict.fromkeys(TIMES, "T"),
-    **dict.fromkeys(("ssim_weight", "grow_share"), "SHARE"),
-    **dict.fromkeys(("initial_opacity", "prune_opacity"), "OPACITY"),
-    **dict.fromkeys(("split_above", "prune_above"), "EXTENTS"),
-    **dict.fromkeys(("opacity_weight", "scale_weight"), "WEIGHT"),
-    **dict.fromkeys(("means_rate", "means_rate_end", "rotation_rate"), "RATE"),
-    **dict.fromkeys(("scale_rate", "opacity_rate", "color_rate"), "RATE"),
-    "footprint": "NAME[:k=v,..]",
-    "seconds": "SECONDS",
-    "initial_scale": "FACTOR",
-    "noise": "FACTOR",
-    "gradient": "NORM",
-}
-"""What `--help` shows for a value; otherwise its type decides."""
-METAVARS_OF_TYPES = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 TIMES_TEXT = "T is a time: a number of steps, or up to 1 a share of the training. See docs/training.md"
-
-MAIN = {
-    "footprint": "how a pixel sees a splat",
-    "scales": "reductions to train at: 1,2,4,8",
-    "scale_repeats": "how often pictures of each scale occur in a pass: 3,1,1,1 (default: the finest twice)",
-    "downsampling": f"how coarse pictures are made: {', '.join(DOWNSAMPLINGS)}",
-    "iterations": "steps in all, also of a training that goes on",
-    "seconds": "train for this long instead, by the clock",
-    "pictures_per_step": "pictures whose mean loss makes a step",
-    "supersampling": "render pictures so many times larger and average them",
-    "sh_degree": "of the spherical harmonics, 0 to 3",
-    "background": f"{', '.join(BACKGROUNDS)} or {RANDOM_BACKGROUND} (default: white for NeRF-synthetic scenes, else "
-    "black)",
-    "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
-    "effects": "auto: look at SCENE first, as `inspect SCENE` does, and take the options that it calls for, but for "
-    "those that are given; none: do not look",
-    "seed": "of everything that is drawn",
-    "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
-    "deterministic": "the same bits in every run on CUDA too, also after a sudden rise of pairs; slower, for the host "
-    "waits for every frame (a CPU always gives the same bits)",
-    "density": f"density control: {', '.join(DENSITIES)}",
-    "max_gaussians": "start with no more than this, and grow no further, evenly towards it; 0: no limit",
-    "random_points": "Gaussians at the start where SCENE has no points (default: 100000, or --max-gaussians where that "
-    "is less)",
-}
-
-
-def attribute_texts(described: type) -> dict[str, str]:
-    """What the docstring of a class says of each of its attributes, as help texts; nothing with python -OO."""
-    section = (inspect.getdoc(described) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
-    texts = {}
-    for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE):
-        text = " ".join(text.split()).replace("`", "").replace("%", "%%").rstrip(".")
-        texts[name] = text[:1].lower() + text[1:]
-    return texts
 
 
 def add_parser(subcommands) -> None:
@@ -133,21 +72,31 @@ def add_parser(subcommands) -> None:
     host = "GiB of memory for other pictures; the rest is decoded again and again (default: 1/2 of what is free)"
     add("--picture-memory-host", type=float, metavar="GIB", help=host)
     add_rank_options(parser)
-    rest = parser.add_argument_group("fine tuning", TIMES_TEXT)
-    types, texts = typing.get_type_hints(TrainingOptions), attribute_texts(TrainingOptions)
-    for field in fields(TrainingOptions):
-        group = parser if field.name in MAIN else rest
-        default = shown_default(field.default)
-        text = MAIN.get(field.name) or texts.get(field.name, "")
-        text += f" (default: {default})" if "default" not in text and default else ""
-        # What is not given is absent, so that a checkpoint's options are only compared with what is.
-        if types[field.name] is bool:
-            group.add_argument(flag(field.name), action="store_true", default=argparse.SUPPRESS, help=text)
-        else:
-            kind = whole_numbers if isinstance(field.default, tuple) else types[field.name]
-            metavar = METAVARS.get(field.name) or METAVARS_OF_TYPES[type(field.default)]
-            group.add_argument(flag(field.name), type=kind, default=argparse.SUPPRESS, metavar=metavar, help=text)
+    add_training_options(parser)
     parser.set_defaults(run=run)
+
+
+def add_training_options(parser) -> None:
+    """The options of `TrainingOptions`, as they are declared."""
+    rest = parser.add_argument_group("fine tuning", TIMES_TEXT)
+    for field in fields(TrainingOptions):
+        said = declared(DECLARATIONS[field.name][1])
+        default = shown_default(field.default)
+        text = as_help(text_of(field.name)) + (f" (default: {default})" if default else "")
+        kind = type(field.default)
+        # What is not given is absent, so that a checkpoint's options are only compared with what is.
+        how = {"default": argparse.SUPPRESS, "help": text}
+        if kind is bool:
+            how |= {"action": "store_true"}
+        else:
+            how |= {"type": whole_numbers if kind is tuple else kind, "metavar": said.metavar or METAVARS[kind]}
+        (parser if said.main else rest).add_argument(flag(field.name), **how)
+
+
+def as_help(text: str) -> str:
+    """The text of an option as `--help` shows it, with other options as the command line spells them."""
+    text = re.sub("`([^`]+)`", lambda match: flag(match[1]) if match[1] in DECLARATIONS else match[1], text)
+    return text[:1].lower() + text[1:].rstrip(".").replace("%", "%%")
 
 
 def shown_default(value) -> str:
@@ -189,10 +138,12 @@ def run_on(ranks: Ranks, args) -> bool:
         # Without --scales, a preset is for those of the checkpoint.
         given.setdefault("scales", (stored or TrainingOptions).scales)
         given = preset_values(args.preset, given["scales"]) | given
-    options = TrainingOptions(**given)
+    usual = {} if stored is None else {"density": stored.density}  # by which it is known what an option means
+    options = TrainingOptions(**(usual | given))
     if stored is not None:
-        kept = [name for name in given if name not in length]
-        differing = [name for name in kept if getattr(options, name) != getattr(stored, name)]
+        asked = {name: getattr(options, name) for name in given}
+        asked |= {name: given[name] for name in chosen if of_other_control(name, options.density)}
+        differing = [name for name in asked if name not in length and asked[name] != getattr(stored, name)]
         if differing:
             named = ", ".join(map(flag, differing))
             raise ValueError(f"{named}: a resumed training keeps the options of its checkpoint")

@@ -2,58 +2,65 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from ..checks import check_value, plain_value
+from ..declared import NOT_NEGATIVE, POSITIVE, SHARE, Options, Range, at_least, described, option
+
+OPACITY = Range(lambda value: 0 <= value < 1, "at least 0 and below 1")
 
 
+@described
 @dataclass(frozen=True)
-class GradientOptions:
+class GradientOptions(Options):
     """When and where `GradientDensity` grows and prunes.
 
     The defaults are those of this package's own training. The recipe of [3DGS] is `GradientOptions(absolute=False,
     densify_until=0.5, split_above=0.01, max_gaussians=0)`.
-
-    Attributes:
-        absolute: Whether gradients are summed as absolute values over pixels [AbsGS], or with their signs [3DGS].
-        gradient: Mean norm above which a Gaussian is cloned or split, by normalized device coordinates; 0: 3e-4 for
-            absolute values, 2e-4 with signs.
-        densify_from: Steps before the first change.
-        densify_until: Share of the training, 0 to 1, after which the number of Gaussians stays.
-        densify_every: Steps between changes, at least 1.
-        reset_every: Steps between resets of the opacities; 0: never.
-        prune_opacity: Least opacity that is kept.
-        split_above: Scale above which a Gaussian is split rather than cloned, in extents of the scene.
-        prune_above: Scale above which a Gaussian is pruned after the first reset, in extents of the scene.
-        max_gaussians: Most Gaussians; 0: no limit. The limit rises evenly from the number at the start to this, until
-            `densify_until`, and those with the largest gradients grow first.
-        white_background: Whether opacities are also lowered when growth begins, which a white background calls for.
 
     Raises:
         TypeError: A value of another type, naming the option.
         ValueError: A value outside its range, naming the option.
     """
 
-    absolute: bool = True
-    gradient: float = 0.0
-    densify_from: int = 500
-    densify_until: float = 0.75
-    densify_every: int = 100
-    reset_every: int = 3000
-    prune_opacity: float = 0.005
-    split_above: float = 0.0025
-    prune_above: float = 0.1
-    max_gaussians: int = 1_000_000
-    white_background: bool = False
-
-    def __post_init__(self):
-        _settle(self)
-        for name in ("split_above", "prune_above"):
-            value = getattr(self, name)
-            check_value(name, 0 < value < math.inf, "positive and finite", value)
-        check_value("gradient", 0 <= self.gradient < math.inf, "finite and not negative", self.gradient)
+    absolute: bool = option(
+        True, "Whether gradients are summed as absolute values over pixels [AbsGS], or with their signs [3DGS]."
+    )
+    gradient: float = option(
+        0.0,
+        "Mean norm above which a Gaussian is cloned or split, by normalized device coordinates; 0: 3e-4 for absolute "
+        "values, 2e-4 with signs.",
+        NOT_NEGATIVE,
+        metavar="NORM",
+    )
+    densify_from: int = option(500, "Steps before the first change.", at_least(0))
+    densify_until: float = option(
+        0.75, "Share of the training, 0 to 1, after which the number of Gaussians stays.", SHARE
+    )
+    densify_every: int = option(100, "Steps between changes, at least 1.", at_least(1))
+    reset_every: int = option(3000, "Steps between resets of the opacities; 0: never.", at_least(0))
+    prune_opacity: float = option(0.005, "Least opacity that is kept.", OPACITY, metavar="OPACITY")
+    split_above: float = option(
+        0.0025,
+        "Scale above which a Gaussian is split rather than cloned, in extents of the scene.",
+        POSITIVE,
+        metavar="EXTENTS",
+    )
+    prune_above: float = option(
+        0.1,
+        "Scale above which a Gaussian is pruned after the first reset, in extents of the scene.",
+        POSITIVE,
+        metavar="EXTENTS",
+    )
+    max_gaussians: int = option(
+        1_000_000,
+        "Most Gaussians; 0: no limit. The limit rises evenly from the number at the start to this, until "
+        "`densify_until`, and those with the largest gradients grow first.",
+        at_least(0),
+    )
+    white_background: bool = option(
+        False, "Whether opacities are also lowered when growth begins, which a white background calls for."
+    )
 
     @property
     def growth_gradient(self) -> float:
@@ -61,49 +68,37 @@ class GradientOptions:
         return self.gradient or (3e-4 if self.absolute else 2e-4)
 
 
+@described
 @dataclass(frozen=True)
-class MonteCarloOptions:
+class MonteCarloOptions(Options):
     """When `MonteCarloDensity` moves and adds Gaussians, and how strong its noise is.
-
-    Attributes:
-        densify_from: Steps before the first change.
-        densify_until: Share of the training, 0 to 1, after which the number of Gaussians stays.
-        densify_every: Steps between changes, at least 1.
-        prune_opacity: Opacity up to which a Gaussian moves to where others are.
-        max_gaussians: Most Gaussians, at least 1.
-        grow_share: Gaussians that are added at a time, as a share of those that are there, 0 to 1.
-        noise: Strength of the noise on the means, in learning rates of the means; 0: none.
 
     Raises:
         TypeError: A value of another type, naming the option.
         ValueError: A value outside its range, naming the option.
     """
 
-    densify_from: int = 500
-    densify_until: float = 0.75
-    densify_every: int = 100
-    prune_opacity: float = 0.005
-    max_gaussians: int = 1_000_000
-    grow_share: float = 0.05
-    noise: float = 5e5
-
-    def __post_init__(self):
-        _settle(self)
-        check_value("max_gaussians", self.max_gaussians >= 1, "at least 1", self.max_gaussians)
-        check_value("grow_share", 0 <= self.grow_share <= 1, "0 to 1", self.grow_share)
-        check_value("noise", 0 <= self.noise < math.inf, "finite and not negative", self.noise)
-
-
-def _settle(options: GradientOptions | MonteCarloOptions) -> None:
-    """Makes the values plain ones of Python, and checks what both kinds of options have."""
-    for field in fields(options):
-        value = plain_value(field.name, getattr(options, field.name), type(field.default))
-        object.__setattr__(options, field.name, value)
-        if type(field.default) is int:
-            least = int(field.name == "densify_every")
-            check_value(field.name, value >= least, f"at least {least}", value)
-    check_value("densify_until", 0 <= options.densify_until <= 1, "0 to 1", options.densify_until)
-    check_value("prune_opacity", 0 <= options.prune_opacity < 1, "at least 0 and below 1", options.prune_opacity)
+    densify_from: int = option(500, "Steps before the first change.", at_least(0))
+    densify_until: float = option(
+        0.75, "Share of the training, 0 to 1, after which the number of Gaussians stays.", SHARE
+    )
+    densify_every: int = option(100, "Steps between changes, at least 1.", at_least(1))
+    prune_opacity: float = option(
+        0.005, "Opacity up to which a Gaussian moves to where others are.", OPACITY, metavar="OPACITY"
+    )
+    max_gaussians: int = option(1_000_000, "Most Gaussians, at least 1.", at_least(1))
+    grow_share: float = option(
+        0.05,
+        "How many Gaussians are added at a time, as a share of those there are, 0 to 1.",
+        SHARE,
+        metavar="SHARE",
+    )
+    noise: float = option(
+        5e5,
+        "Strength of the noise on the means, in learning rates of the means; 0: none.",
+        NOT_NEGATIVE,
+        metavar="FACTOR",
+    )
 
 
 def options_of(kind: type, options: Any) -> Any:

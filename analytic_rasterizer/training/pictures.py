@@ -19,7 +19,7 @@ from .. import io
 from ..io.common import naming
 from ..render.settings import GaussianRasterizationSettings
 from .captures import Photograph
-from .options import check_scales
+from .parts import check_scales
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size
 from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens

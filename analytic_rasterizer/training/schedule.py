@@ -9,13 +9,10 @@ import torch
 
 from ..density.control import passes
 from .options import TrainingOptions
+from .parts import steps_at
 
 SH_SHARE = 0.1  # of the training, after which another degree is due at the latest
-FIRST_CHANGE, CHANGE_PERIOD = 500, 100  # steps, of density control in a training that is not short
-LEAST_PERIOD = 10  # steps, whose pictures make an average
-SHORT = 7000  # steps of the shortest training that is not
 PASSES = 8  # that are known at a time: who fetches pictures looks ahead
-TOO_SHORT = 150  # steps, in fewer than which new Gaussians do not learn enough
 
 
 class Progress:
@@ -126,30 +123,9 @@ def rates_factor_at(step: int, options: TrainingOptions, steps: float | None = N
     return 0.5 ** (over / options.rates_half_life) if options.rates_half_life else 1.0
 
 
-def steps_at(time: float, steps: float) -> float:
-    """A time of the options in steps, of `steps` in all."""
-    return time if time > 1 else time * steps
-
-
-def growth_times(options: TrainingOptions, steps: float) -> dict[str, float]:
-    """When density control acts in a training of `steps`, as it is told: a share for `densify_until`, else steps.
-
-    What the options leave open comes sooner in a short training, in proportion, and never in one that is too short.
-    """
-    pace = min(steps / SHORT, 1)
-    start, until = options.densify_from, options.densify_until
-    if start == -1:
-        start = steps if steps < TOO_SHORT and options.densify_every == 0 else FIRST_CHANGE * pace
-    return {
-        "densify_from": round(start if start > 1 else start * steps),
-        "densify_until": until if until <= 1 else min(until / steps, 1.0),
-        "densify_every": options.densify_every or max(round(CHANGE_PERIOD * pace), LEAST_PERIOD),
-    }
-
-
 def changes_at(options: TrainingOptions, steps: int) -> range:
     """The steps at which density control changes the number of Gaussians, in a training of so many in one process."""
-    times = growth_times(options, steps)
+    times = options.growth.times(steps)
     period = times["densify_every"]
     first = (times["densify_from"] // period + 1) * period
     return range(first, math.ceil(times["densify_until"] * steps), period)

@@ -17,7 +17,8 @@ from .captures import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture
 from .extent import seen_distance
 from .health import FAINTEST
 from .model import random_points
-from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
+from .options import TrainingOptions
+from .parts import BACKGROUNDS, RANDOM_BACKGROUND
 from .placement import focus_of, points_in_view
 from .unused import check_effect
 

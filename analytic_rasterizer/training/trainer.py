@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .. import _C
-from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
+from ..density import FixedDensity, GradientDensity, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
@@ -28,7 +28,7 @@ from .model import enlarged, gradients_by_autograd
 from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
-from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
+from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
@@ -183,7 +183,7 @@ class Trainer:
         """
         self.progress.measure(elapsed)
         if self.options.seconds and self.options.density != "none":
-            times = growth_times(self.options, self.progress.expected(self.options.iterations))
+            times = self.options.growth.times(self.progress.expected(self.options.iterations))
             self.density.options = replace(self.density.options, **times)
 
     def change_length(self, factor: float) -> None:
@@ -400,13 +400,10 @@ def make_density(
     ranks: Ranks = ALONE,
 ) -> FixedDensity:
     """The density control that `options.density` names, with what the options say about it."""
-    common = {"seed": options.seed, "ranks": ranks}
-    if options.density == "none":
+    told, common = options.control, {"seed": options.seed, "ranks": ranks}
+    if told is None:
         return FixedDensity(gaussians, optimizer, **common)
-    kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
-    known = vars(options) | growth_times(options, options.iterations)
-    known |= {"absolute": options.density == "absgrad", "white_background": white_background}
-    chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
-    if options.density == "mcmc":
-        return MonteCarloDensity(gaussians, optimizer, chosen, **common)
-    return GradientDensity(gaussians, optimizer, extent, chosen, **common)
+    if isinstance(told, MonteCarloOptions):
+        return MonteCarloDensity(gaussians, optimizer, told, **common)
+    told = replace(told, white_background=white_background)
+    return GradientDensity(gaussians, optimizer, extent, told, **common)

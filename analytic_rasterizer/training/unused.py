@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from .options import TrainingOptions, flag
-from .schedule import SH_SHARE, changes_at, growth_times, steps_at
-
-GROWTH = ("densify_from", "densify_until", "densify_every", "prune_opacity")  # of every density control
-GRADIENTS = ("gradient", "gradient_scales", "split_above", "prune_above", "reset_every")
-MONTE_CARLO = ("grow_share", "noise")
+from ..density import GradientOptions
+from .options import DECLARATIONS, TrainingOptions, controls_of, flag, of_other_control
+from .parts import steps_at
+from .schedule import SH_SHARE, changes_at
 
 
 def check_effect(options: TrainingOptions, given: Collection[str], start: str) -> None:
@@ -20,8 +18,9 @@ def check_effect(options: TrainingOptions, given: Collection[str], start: str) -
     """
     reasons = without_effect(options, start)
     for name in given:
-        if name in reasons:
-            raise ValueError(f"{flag(name)} has no effect: {reasons[name]}")
+        reason = of_other_control(name, options.density) or reasons.get(name)
+        if reason is not None:
+            raise ValueError(f"{flag(name)} has no effect: {reason}")
 
 
 def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str, str]:
@@ -39,14 +38,8 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
         note(["random_points"], f"the training starts from {start}")
     if start == "a scene":
         note(["initial_opacity", "initial_scale"], "the training starts from a scene")
-    if options.density not in ("3dgs", "absgrad"):
-        note(GRADIENTS, f"it is for the density controls 3dgs and absgrad, got {options.density}")
-    if options.density != "mcmc":
-        note(MONTE_CARLO, f"it is for the density control mcmc, got {options.density}")
-    if options.density == "none":
-        note(GROWTH, "the density control none changes nothing")
     if options.densify_until == 0:
-        note({*GROWTH, *GRADIENTS, "grow_share"} - {"densify_until"}, "densify_until is 0, so that nothing changes")
+        note(growth_of(options) - {"densify_until"}, "densify_until is 0, so that nothing changes")
     if len(options.scales) == 1:
         note(["gradient_scales"], "there is one scale")
         if options.scales == (1,):
@@ -62,6 +55,11 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
     return reasons
 
 
+def growth_of(options: TrainingOptions) -> set[str]:
+    """The options that say when and how density control changes the number of Gaussians."""
+    return {name for name in DECLARATIONS if options.density in controls_of(name)} - {"noise"}
+
+
 def _note_times(options: TrainingOptions, note) -> None:
     """What comes after the end, by the steps of the training."""
     steps = options.iterations
@@ -70,17 +68,18 @@ def _note_times(options: TrainingOptions, note) -> None:
         note(["sh_every"], f"a degree is added every {SH_SHARE * steps:g} steps, a tenth of the training, anyway")
     if steps_at(options.rates_from, steps) >= steps:
         note(["rates_from", "rates_half_life"], f"rates fall from step {options.rates_from:,g} on, and {of_training}")
-    if options.density == "none" or options.densify_until == 0:
+    if options.control is None or options.densify_until == 0:
         return
-    changes, times = changes_at(options, steps), growth_times(options, steps)
-    end = times["densify_until"] * steps
+    changes, end = changes_at(options, steps), options.growth.times(steps)["densify_until"] * steps
     if not changes:
         reason = (
             f"the number of Gaussians never changes: the first change would be at step {changes.start:,}, and growth "
             f"ends at {end:,g}"
         )
-        note({*GROWTH, *GRADIENTS, "grow_share"}, f"{reason} ({of_training})")
-    elif options.reset_every >= end:
+        note(growth_of(options), f"{reason} ({of_training})")
+    if not isinstance(options.control, GradientOptions):
+        return
+    if options.reset_every >= end:
         note(["reset_every"], f"the first would be after step {options.reset_every:,}, and growth ends at {end:,g}")
     if options.reset_every == 0 or options.reset_every >= max(changes, default=0):
         reset = f"the first is after step {options.reset_every:,}" if options.reset_every else "reset_every is 0"

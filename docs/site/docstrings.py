@@ -1,9 +1,11 @@
 """How the API reference reads docstrings, for mkdocstrings (mkdocs.yml).
 
 Docstrings are Google's, with two freedoms: parameters may share a description ("width, height: Size, px."), and what is
-returned may be a text in place of named values. Names of the library in them become links.
+returned may be a text in place of named values. Names of the library in them become links. Options that are declared
+(analytic_rasterizer/declared.py) are attributes with the text of their declaration.
 """
 
+import ast
 import re
 import textwrap
 
@@ -17,13 +19,42 @@ NAME = re.compile(r"(?<!\[)`([A-Za-z_][\w.]*)`(?!\])")
 class Docstrings(griffe.Extension):
     def on_package(self, *, pkg, **kwargs):
         self.package = pkg
+        self.declared = {}  # default and text of options, by their class and name
+        self._find_declared(pkg)
         self._visit(pkg)
+
+    def _find_declared(self, parent):
+        for member in parent.members.values():
+            if member.is_alias or not (member.is_module or member.is_class):
+                continue
+            self._find_declared(member)
+            if member.is_class:
+                self.declared[member.name] = dict(filter(None, map(_declaration, member.members.values())))
+                for base in member.bases:
+                    self.declared[member.name] |= self.declared.get(str(base), {})
+
+    def _add_declared(self, kind):
+        """Options in a class's docstring and signature: its own, and those of parts, which it has as PART.NAME."""
+        options = dict(self.declared.get(kind.name, {}))
+        for member in kind.members.values():
+            part, _, name = str(getattr(member, "value", "")).partition(".")
+            if name == member.name and name in self.declared.get(part, ()):
+                options[name] = self.declared[part][name]
+        if not options:
+            return
+        for name in options.keys() & kind.members.keys():
+            kind.members[name].value = options[name][0]
+        head, raises, rest = kind.docstring.value.partition("Raises:\n")
+        entries = "".join(f"    {name}: {text}\n" for name, (_, text) in options.items())
+        kind.docstring.value = f"{head.rstrip()}\n\nAttributes:\n{entries}\n{raises}{rest}"
 
     def _visit(self, parent):
         for member in parent.members.values():
             if member.is_alias:
                 continue
             if member.docstring:
+                if member.is_class:
+                    self._add_declared(member)
                 self._read(member)
             if member.is_module or member.is_class:
                 self._visit(member)
@@ -57,6 +88,15 @@ class Docstrings(griffe.Extension):
                 return f"[{match[0]}][{found}]"
             module = module.parent
         return match[0]
+
+
+def _declaration(member):
+    """Name, default and text of a class's attribute that is `option(default, text, ..)`."""
+    value = str(member.value) if not member.is_alias and member.is_attribute and member.value is not None else ""
+    if not value.startswith("option("):
+        return None
+    default, text = ast.parse(value, mode="eval").body.args[:2]
+    return member.name, (ast.unparse(default), ast.literal_eval(text))
 
 
 def _is_described(parent, name):

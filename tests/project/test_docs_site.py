@@ -73,6 +73,8 @@ def test_pages_load_nothing_from_the_network(tmp_path):
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"?(https?:)?//", page.read_text())
         assert not loaded, page
     assert not list(tmp_path.rglob("*.py"))
+    reference = (tmp_path / "api" / "training.html").read_text()  # has what options are declared with
+    assert "Share of 1 - SSIM in the loss, next to the mean absolute error." in reference
 
 
 def test_strict_build_refuses_dead_links(tmp_path):

@@ -16,7 +16,6 @@ from analytic_rasterizer import density, io
 from analytic_rasterizer.density import GradientOptions, MonteCarloOptions
 from analytic_rasterizer.optim import FusedAdam, SparseGaussianAdam, clear_moments, replace_rows
 from analytic_rasterizer.training import Pictures, TrainingOptions
-from analytic_rasterizer.training.schedule import growth_times
 
 EXTENT = 10.0
 SIGNED = GradientOptions(absolute=False, densify_from=0, densify_every=1, split_above=0.01, max_gaussians=0)
@@ -215,7 +214,7 @@ def test_goes_on_from_its_state(kind):
 
 def test_defaults_are_those_of_training():
     usual = TrainingOptions()
-    of_training = vars(usual) | growth_times(usual, usual.iterations)
+    of_training = usual.to_dict() | usual.growth.times(usual.iterations)
     for options in (GradientOptions(), MonteCarloOptions()):
         for field in fields(options):
             if field.name not in ("absolute", "white_background"):

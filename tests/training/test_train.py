@@ -185,7 +185,7 @@ def test_help_of_train_has_every_default(capsys):
 
 
 def test_help_of_train_says_what_every_option_is(capsys):
-    """From the docstring of TrainingOptions, where the command has no words of its own."""
+    """As it is declared; options of one density control say so."""
     options = help_of_options(capsys)
     for name, (_, text) in options.items():
         assert len(text.split("(default:")[0]) > 4, name
@@ -193,6 +193,11 @@ def test_help_of_train_says_what_every_option_is(capsys):
         "SHARE",
         "share of 1 - SSIM in the loss, next to the mean absolute error (default: 0.2)",
     )
+    assert options["noise"] == (
+        "FACTOR",
+        'of "mcmc": strength of the noise on the means, in learning rates of the means; 0: none (default: 500000)',
+    )
+    assert "not more than --max-gaussians" in options["random_points"][1]
 
 
 def test_help_of_train_says_what_values_are(capsys):

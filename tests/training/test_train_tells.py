@@ -216,7 +216,7 @@ assert "torch._dynamo" not in sys.modules
     ],
 )
 def test_times_are_steps_or_shares(steps, options, expected):
-    times = schedule.growth_times(TrainingOptions(iterations=steps, **options), steps)
+    times = TrainingOptions(iterations=steps, **options).growth.times(steps)
     assert tuple(times[name] for name in ("densify_from", "densify_until", "densify_every")) == expected
 
 
@@ -226,7 +226,7 @@ def test_times_of_the_preset_are_those_of_3dgs():
     assert list(schedule.changes_at(options, 30_000)) == list(range(600, 15_000, 100))
     assert (options.iterations, options.reset_every) == (30_000, 3000)
     in_steps = TrainingOptions.preset("3dgs", densify_from=500, densify_until=15_000, densify_every=100)
-    assert schedule.growth_times(in_steps, 30_000) == schedule.growth_times(options, 30_000)
+    assert in_steps.growth.times(30_000) == options.growth.times(30_000)
 
 
 @pytest.mark.parametrize("steps, options", [(600, {}), (7000, {}), (40, {"densify_from": 3, "densify_every": 4})])
