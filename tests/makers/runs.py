@@ -7,6 +7,7 @@ from analytic_rasterizer.training import model as g
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
 
 
+@torch.no_grad()
 def scatter(gaussians) -> None:
     """Puts Gaussians where no picture shows them, and others where only some pictures do."""
     gaussians.means[::3, 1] += 50

@@ -165,10 +165,11 @@ def help_of_options(capsys) -> dict[str, tuple[str, str]]:
     """Metavar and text of every option of a training."""
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
-    shown = re.sub(r" (?:main|fine tuning|options):", " --", " ".join(capsys.readouterr().out.split()))
+    entries = re.findall(r"^  --([\w-]+)((?:.*\n)(?:   .*\n)*)", capsys.readouterr().out + "\n", re.MULTILINE)
+    shown = {name.replace("-", "_"): " ".join(text.split()) for name, text in entries}
     found = {}
     for field in fields(TrainingOptions):
-        text = shown.rsplit(f" --{field.name.replace('_', '-')} ", 1)[1].split(" --")[0]
+        text = shown[field.name]
         metavar = "" if isinstance(field.default, bool) else text.split()[0]
         found[field.name] = metavar, text.removeprefix(metavar).strip()
     return found
