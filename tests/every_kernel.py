@@ -61,9 +61,9 @@ class Image(NamedTuple):
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images of `moment`. Those of `box` with four
 # samples need 1024x1024, and only they are given so many. Lists of thousands of splats have chunks
-# after the front, and several segments; lists of kLongList pairs or more (csrc/cuda/tuning.h) are cut in large images
-# too, and alone in small ones with 16 cells, and have their own layout. Where Gaussians are opaque,
-# pixels close (so little light is left that 3DGS stops) before their lists end.
+# after the front, and several segments; lists of kLongList pairs or more (csrc/cuda/moment/policy.h) are cut in large
+# images too, and alone in small ones with 16 cells, and have their own layout. Where Gaussians are opaque, pixels
+# close (so little light is left that 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
     "large": Image(512, 512, 600),

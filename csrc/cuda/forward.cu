@@ -24,7 +24,7 @@ namespace ar::cuda {
 
 void project(const ProjectParams& p, cudaStream_t stream) {
   launch_rows(project_kernel<Camera<float>>, project_kernel<FullCamera<float>>, p, stream,
-              multiprocessors() * kProjectBlocksPerSm);
+              multiprocessors() * ProjectPolicy::kBlocksPerSm);
 }
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
   launch_rows(project_rows_kernel<Camera<float>>, project_rows_kernel<FullCamera<float>>, p, stream);
@@ -52,8 +52,9 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
              p.values[1 - pass % 2]);
     }
   });
-  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kOffsetTiles), kOffsetTiles * kOffsetLanes}, stream,
-         p.tiles[digits.passes % 2], p.counts, grid.tiles(), p.tile_offsets, p.feedback);
+  constexpr int kTiles = BinPolicy::kOffsetTiles, kThreads = kTiles * BinPolicy::kOffsetLanes;
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kTiles), kThreads}, stream, p.tiles[digits.passes % 2],
+         p.counts, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
@@ -71,8 +72,8 @@ int tile_sort_result(TileGrid grid) { return TileDigits(grid).passes % 2; }
 void count_depths(const DepthSort& p, void* memory, ZeroedMemory other_scratch, ZeroedMemory of_tiles,
                   cudaStream_t stream) {
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  launch(count_depths_kernel, {multiprocessors() * kCountBlocksPerSm, kCountThreads}, stream, p.keys[0], p.ranges,
-         p.with_slots, p.n, scratch.histograms, p.counts, other_scratch, of_tiles);
+  launch(count_depths_kernel, {multiprocessors() * BinPolicy::kCountBlocksPerSm, BinPolicy::kCountThreads}, stream,
+         p.keys[0], p.ranges, p.with_slots, p.n, scratch.histograms, p.counts, other_scratch, of_tiles);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
@@ -85,8 +86,9 @@ void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
   const TileDigits digits(p.grid);
-  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, digits);
-  launch(emit_long_pairs_kernel, {multiprocessors() * kLongBlocksPerSm, kEmitThreads}, stream, p, digits);
+  launch(emit_pairs_kernel, {blocks_of(p.n, BinPolicy::kEmitSplats), BinPolicy::kEmitThreads}, stream, p, digits);
+  launch(emit_long_pairs_kernel, {multiprocessors() * BinPolicy::kLongBlocksPerSm, BinPolicy::kEmitThreads}, stream, p,
+         digits);
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
@@ -102,8 +104,8 @@ int multiprocessors_of_device() { return int(multiprocessors()); }
 
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
-  const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
-  const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
+  const LaunchShape shape = {blocks_of(grid.tiles(), PlanPolicy::kThreads), PlanPolicy::kThreads};
+  const LaunchShape counters = {PlanState::kCounters, PlanPolicy::kCountThreads};
   launch(count_work_kernel, counters, stream, lists, grid.tiles(), cut, plan.state);
   launch(plan_kernel, shape, stream, lists, grid, samples, cut, layout, plan);
 }

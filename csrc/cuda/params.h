@@ -14,6 +14,7 @@
 #include "core/rows.h"
 #include "core/weight.h"
 #include "cuda/bin/chunk_plan.h"
+#include "cuda/bin/policy.h"
 
 namespace ar::cuda {
 
@@ -234,10 +235,8 @@ int64_t max_items();
 /// Bytes of scratch memory, multiples of 16. That of the sort by depth begins with histograms.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
-/// Threads of a block of emit_pairs, and splats of a thread: few blocks, because each waits for the one before.
-inline constexpr int kEmitThreads = 256, kEmitRows = 2, kEmitSplats = kEmitThreads * kEmitRows;
 inline int64_t emit_scratch(int64_t n) {
-  return ((2 + (n + kEmitSplats - 1) / kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
+  return ((2 + (n + BinPolicy::kEmitSplats - 1) / BinPolicy::kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
 }
 
 /// Sorts splats by depth, ties in input order. The result is order[0].

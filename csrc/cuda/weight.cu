@@ -5,21 +5,22 @@
 #include "core/footprint/registry.h"
 #include "cuda/launch.cuh"
 #include "cuda/params.h"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 namespace {
 
+constexpr int kThreads = 128;
+
 // F: the footprint. T: float or double. All arrays: [n].
 template <class F, typename T> __global__ void weight_kernel(const WeightParams<T> params) {
   wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kWeightThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < params.n) params.weights[i] = ar::weight<F>(params.covs[i], params.offsets[i], params.options);
 }
 
 template <class F, typename T> __global__ void weight_vjp_kernel(const WeightParams<T> params) {
   wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kWeightThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= params.n) return;
   const WeightGrad<T> g = ar::weight_vjp<F>(params.covs[i], params.offsets[i], params.options, params.dL_dweights[i]);
   params.dL_doffsets[i] = g.offset;
@@ -29,13 +30,13 @@ template <class F, typename T> __global__ void weight_vjp_kernel(const WeightPar
 template <typename T> void launch_weight(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
   if (p.n == 0) return;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
-    launch(weight_kernel<decltype(f), T>, {blocks_of(p.n, kWeightThreads), kWeightThreads}, stream, p);
+    launch(weight_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
   });
 }
 template <typename T> void launch_weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
   if (p.n == 0) return;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
-    launch(weight_vjp_kernel<decltype(f), T>, {blocks_of(p.n, kWeightThreads), kWeightThreads}, stream, p);
+    launch(weight_vjp_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
   });
 }
 

@@ -52,7 +52,7 @@ class Renderer {
 
 TEST(PairGuessTest, CountsTheFirstFramesAndThenLeavesAReserve) {
   Renderer renderer;
-  EXPECT_EQ(renderer.count_frames(1000, 1000000), kCountedFrames);
+  EXPECT_EQ(renderer.count_frames(1000, 1000000), PairGuessPolicy::kCountedFrames);
   const int64_t room = renderer.frame(1000, 1000000);
   EXPECT_GE(room, 1250000);
   EXPECT_LE(room, (1250000 + (1 << 16)) * 9 / 8);
@@ -93,11 +93,11 @@ TEST(PairGuessTest, CountsAgainAfterAnOverflowAndOnlyThen) {
   for (int k = 0; k < 100; ++k) {
     const int64_t next = renderer.frame(1000, 10 * room);
     counted += next == 0;
-    if (counted == kRecountedFrames && next > 0) {
+    if (counted == PairGuessPolicy::kRecountedFrames && next > 0) {
       EXPECT_GE(next, 12 * room);
     }
   }
-  EXPECT_EQ(counted, kRecountedFrames);
+  EXPECT_EQ(counted, PairGuessPolicy::kRecountedFrames);
 }
 
 TEST(PairGuessTest, GuessesWhateverTheNumberOfGaussians) {
@@ -135,7 +135,7 @@ TEST(PairGuessTest, ALargerFrameThatIsCountedAnywayIsNoReasonToCountOthers) {
 
 TEST(PairGuessTest, NeverExceedsTheMost) {
   Renderer renderer;
-  for (int frame = 0; frame < 2 * kCountedFrames; ++frame)
+  for (int frame = 0; frame < 2 * PairGuessPolicy::kCountedFrames; ++frame)
     EXPECT_LE(renderer.guesses.begin(0, kGrid, 10, 1 << 20, Counting::kIfNeeded).capacity, 1 << 20);
   renderer.count_frames(10, (int64_t(1) << 32) - 1);
   EXPECT_EQ(renderer.guesses.begin(0, kGrid, 10, 1 << 20, Counting::kNever).capacity, 1 << 20);
@@ -165,7 +165,8 @@ TEST(PairGuessTest, WaitsInFewFramesOfACollectionWithASizePerPhoto) {
     }
   }
   EXPECT_LE(overflows, 2);
-  EXPECT_LE(waits[0] + waits[1], kSizeClasses * kCountedFrames + overflows * kRecountedFrames);
+  EXPECT_LE(waits[0] + waits[1],
+            kSizeClasses * PairGuessPolicy::kCountedFrames + overflows * PairGuessPolicy::kRecountedFrames);
   EXPECT_EQ(waits[2], 0);
 }
 

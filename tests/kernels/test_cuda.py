@@ -271,7 +271,7 @@ def test_moving_samples_with_a_list_for_each_pixel(samples):
 
 @pytest.mark.parametrize("samples", [1, 4, 16])
 def test_longest_lists_of_moving_samples(samples):
-    """A warp or more for each pixel of a tile whose list is long (longest_list() of csrc/cuda/tuning.h)."""
+    """A warp or more for each pixel of a tile whose list is long (longest_list() of csrc/cuda/moment/policy.h)."""
     scene = splats_smaller_than_a_pixel()
     scene["means3D"] *= 0.2
     settings = settings_for(("moment", {"samples": samples}), Camera(image_height=24, image_width=40))

@@ -854,7 +854,7 @@ def test_every_kernel(device, monkeypatch, capsys):
 def test_every_kernel_has_images_that_need_it(footprint, options):
     """What its comment says of lists and of pixels that close."""
     program = importlib.import_module("every_kernel")
-    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "tuning.h").read_text())[1]
+    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "moment" / "policy.h").read_text())[1]
     longest, most_in_tile, closed, short = {}, {}, {}, {}
     for name, image in program.IMAGES.items():
         settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)

@@ -8,10 +8,11 @@
 #include <type_traits>
 
 #include "core/bin.h"
+#include "cuda/bin/policy.h"
 #include "cuda/bin/sort.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
 #include "cuda/params.h"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -50,30 +51,31 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
 }
 
 /// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits]. counts: [1].
-__global__ void __launch_bounds__(kCountThreads)
+__global__ void __launch_bounds__(BinPolicy::kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
   wait_for_earlier_kernels();
+  constexpr int kThreads = BinPolicy::kCountThreads, kAtOnce = BinPolicy::kCountAtOnce;
   __shared__ uint32_t local[kDepthHistogramWords];
-  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
-  const int64_t thread = int64_t(blockIdx.x) * kCountThreads + threadIdx.x;
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
+  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kThreads) local[b] = 0;
+  const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t stride = int64_t(gridDim.x) * kThreads, rounded = (n + 31) / 32 * 32;
   set_to_zero(other_scratch, thread, stride);
   set_to_zero(of_tiles, thread, stride);
   __syncthreads();
   int64_t pairs = 0, splats = 0;
-  for (int64_t from = thread; from < rounded; from += kCountAtOnce * stride) {
-    uint32_t key[kCountAtOnce];
-    int pairs_of[kCountAtOnce];
+  for (int64_t from = thread; from < rounded; from += kAtOnce * stride) {
+    uint32_t key[kAtOnce];
+    int pairs_of[kAtOnce];
 #pragma unroll
-    for (int k = 0; k < kCountAtOnce; ++k) {
+    for (int k = 0; k < kAtOnce; ++k) {
       const int64_t i = from + k * stride;
       key[k] = i < n ? keys[i] : kCulledKey;
     }
 #pragma unroll
-    for (int k = 0; k < kCountAtOnce; ++k) pairs_of[k] = key[k] != kCulledKey ? ranges[from + k * stride].count : 0;
+    for (int k = 0; k < kAtOnce; ++k) pairs_of[k] = key[k] != kCulledKey ? ranges[from + k * stride].count : 0;
 #pragma unroll
-    for (int k = 0; k < kCountAtOnce; ++k) {
+    for (int k = 0; k < kAtOnce; ++k) {
       const bool valid = key[k] != kCulledKey;
       count_digits<kDepthBits, kDepthPasses>(key[k], valid, local);
       if (!with_slots) pairs += pairs_of[k];
@@ -82,12 +84,12 @@ __global__ void __launch_bounds__(kCountThreads)
     if (with_slots) number_slots(pairs_of, ranges + from, stride, *counts);
   }
   __syncthreads();
-  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) {
+  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kThreads) {
     if (local[b]) atomicAdd(&histograms[b], local[b]);
   }
   int64_t all_pairs, all_splats;
-  sum_before<kCountThreads / 32>(pairs, int64_t(0), all_pairs);
-  sum_before<kCountThreads / 32>(splats, int64_t(0), all_splats);
+  sum_before<kThreads / 32>(pairs, int64_t(0), all_pairs);
+  sum_before<kThreads / 32>(splats, int64_t(0), all_splats);
   if (threadIdx.x == 0) {
     if (!with_slots) add_to_count(counts->pairs, all_pairs);
     add_to_count(counts->splats, all_splats);
@@ -107,7 +109,7 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
 
 /// Digits of the sort by tile: as few, then as short as the number of tiles allows.
 struct TileDigits {
-  static constexpr int kMostBits = kTileDigitBits, kMostPasses = kTileDigits;
+  static constexpr int kMostBits = BinPolicy::kTileDigitBits, kMostPasses = BinPolicy::kTileDigits;
   int passes = 1, bits = kMostBits - 1;
 
   explicit TileDigits(TileGrid grid) {
@@ -132,7 +134,7 @@ class PairWriter {
   /// counts: [kMostCounts] shared. All threads must call it, and __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
-    for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
+    for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += BinPolicy::kEmitThreads) counts[b] = 0;
   }
   __device__ void write(int64_t position, uint32_t tile, int32_t splat, int32_t slot) {
     params_.tiles[position] = tile;
@@ -146,7 +148,7 @@ class PairWriter {
   /// All threads must call it.
   __device__ void finish() {
     __syncthreads();
-    for (int b = threadIdx.x; b < digits_.passes * digits_.bins(); b += kEmitThreads) {
+    for (int b = threadIdx.x; b < digits_.passes * digits_.bins(); b += BinPolicy::kEmitThreads) {
       if (counts_[b]) atomicAdd(&params_.tile_counts[b], counts_[b]);
     }
   }
@@ -190,37 +192,38 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
 /// In order of depth, then rows of tiles. Long splats (tiles beyond 8x8) are only listed.
-__global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
+__global__ void __launch_bounds__(BinPolicy::kEmitThreads,
+                                  blocks_per_sm(BinPolicy::kEmitBlocks, BinPolicy::kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
-  constexpr int kWarps = kEmitThreads / 32;
+  constexpr int kThreads = BinPolicy::kEmitThreads, kRows = BinPolicy::kEmitRows, kWarps = kThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
-  __shared__ MaskedPair stages[kEmitRows][kWarps][32 * kManyTiles];
+  __shared__ MaskedPair stages[kRows][kWarps][32 * kManyTiles];
   const int64_t n = params.counts->splats;
-  if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
+  if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * BinPolicy::kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
   PairWriter writer(params, digits, digit_counts);
   __syncthreads();
-  int32_t ids[kEmitRows];
-  SplatTiles touched[kEmitRows] = {};
-  int32_t slots[kEmitRows] = {};
+  int32_t ids[kRows];
+  SplatTiles touched[kRows] = {};
+  int32_t slots[kRows] = {};
 #pragma unroll
-  for (int row = 0; row < kEmitRows; ++row) {
-    const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
+  for (int row = 0; row < kRows; ++row) {
+    const int64_t r = int64_t(block_id) * BinPolicy::kEmitSplats + row * kThreads + threadIdx.x;
     ids[row] = r < n ? params.order[r] : -1;
   }
 #pragma unroll
-  for (int row = 0; row < kEmitRows; ++row) {
+  for (int row = 0; row < kRows; ++row) {
     if (ids[row] >= 0) {
       touched[row] = params.splat_tiles[ids[row]];
       if (params.slot_pairs) slots[row] = params.ranges[ids[row]].first;
     }
   }
-  uint32_t before[kEmitRows], sum = 0;
+  uint32_t before[kRows], sum = 0;
 #pragma unroll
-  for (int row = 0; row < kEmitRows; ++row) {
+  for (int row = 0; row < kRows; ++row) {
     uint32_t of_row;
     before[row] = sum + sum_before<kWarps>(uint32_t(touched[row].count), 0u, of_row);
     sum += of_row;
@@ -229,9 +232,9 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
 
   // While earlier blocks count, tiles are listed in shared memory, for neighbouring lanes to write.
   const int warp = threadIdx.x / 32;
-  int up_to[kEmitRows];  // listed, up to this lane
+  int up_to[kRows];  // listed, up to this lane
 #pragma unroll
-  for (int row = 0; row < kEmitRows; ++row) {
+  for (int row = 0; row < kRows; ++row) {
     const TileMask mask = few_tiles(touched[row]);
     const int own = mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
@@ -254,7 +257,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   __syncthreads();
   const int columns = params.grid.columns();
 #pragma unroll
-  for (int row = 0; row < kEmitRows; ++row) {
+  for (int row = 0; row < kRows; ++row) {
     const SplatTiles& of_splat = touched[row];
     const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
@@ -310,16 +313,16 @@ __device__ inline BoxOfTiles box_of_tiles(const Support<float>& support, TileGri
 
 /// Pairs of patches. One block: slow but rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
-  constexpr int kWarps = kEmitThreads / 32;
+  constexpr int kThreads = BinPolicy::kEmitThreads, kWarps = kThreads / 32;
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
-  const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
+  const int64_t n = params.counts->splats, n_rounded = (n + kThreads - 1) / kThreads * kThreads;
   const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
   // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. One for the whole image always fits.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
-  for (int64_t r = threadIdx.x; r < n; r += kEmitThreads) {
+  for (int64_t r = threadIdx.x; r < n; r += kThreads) {
     const BoxOfTiles tiles = tiles_of_splat(params.order[r]);
 #pragma unroll
     for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_patches(k + 1).count();
@@ -335,7 +338,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
 
   const int64_t columns = grid.columns();
   int64_t before = 0;
-  for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
+  for (int64_t r = threadIdx.x; r < n_rounded; r += kThreads) {
     const int32_t id = r < n ? params.order[r] : -1;
     const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles{{0, -1}, {0, -1}};
     int64_t all;
@@ -353,10 +356,10 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
 }
 
 /// A warp per long splat, which in emit_pairs would be in a few blocks; or one block for pairs of patches.
-__global__ void __launch_bounds__(kEmitThreads)
+__global__ void __launch_bounds__(BinPolicy::kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
-  constexpr int kWarps = kEmitThreads / 32;
+  constexpr int kWarps = BinPolicy::kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   const bool in_patches = params.counts->in_patches(params.capacity);
   if (blockIdx.x == 0 && threadIdx.x == 0 && !in_patches) params.counts->listed = params.counts->pairs;
@@ -392,15 +395,16 @@ __global__ void __launch_bounds__(kEmitThreads)
 }
 
 /// Reports the pairs to the host. tiles: [counts->listed]. counts: [1]. tile_offsets: [tile_count + 1].
-__global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
+__global__ void __launch_bounds__(BinPolicy::kOffsetTiles* BinPolicy::kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
     *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(counts->pairs), uint64_t(0xffffffff));
-  const int64_t tile = int64_t(blockIdx.x) * kOffsetTiles + threadIdx.x / kOffsetLanes;
-  const int first = partition_point<kOffsetLanes>(int(counts->listed), [&](int k) { return tiles[k] < tile; });
-  if (tile <= tile_count && threadIdx.x % kOffsetLanes == 0) tile_offsets[tile] = first;
+  const int64_t tile = int64_t(blockIdx.x) * BinPolicy::kOffsetTiles + threadIdx.x / BinPolicy::kOffsetLanes;
+  const int first =
+      partition_point<BinPolicy::kOffsetLanes>(int(counts->listed), [&](int k) { return tiles[k] < tile; });
+  if (tile <= tile_count && threadIdx.x % BinPolicy::kOffsetLanes == 0) tile_offsets[tile] = first;
 }
 
 }  // namespace ar::cuda

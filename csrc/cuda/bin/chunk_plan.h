@@ -6,10 +6,13 @@
 #include <cstdint>
 
 #include "core/stages.h"
-#include "cuda/tuning.h"
+#include "cuda/moment/policy.h"
+#include "cuda/still/policy.h"
 
 namespace ar::cuda {
 
+/// Blocks of 256 threads that fill a multiprocessor. Last bits depend on it, by front_chunks().
+inline constexpr int kBlocksPerSm = 8;
 /// Pairs of a chunk of still/: the work of a warp of blend_vjp. Between chunks are checkpoints.
 inline constexpr int kChunkLength = 256;
 /// Length of a chunk that holds any list.
@@ -23,9 +26,9 @@ inline constexpr int kNoList = 1 << 30;
 /// tiles have a tail.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more pairs there are patches
-  if (2 * grid.tiles() <= blocks_at_once) return kShortFront;
+  if (2 * grid.tiles() <= blocks_at_once) return StillPolicy::kShortFront;
   const int share = int(pairs < kMost ? pairs : kMost) / blocks_at_once;
-  int front = kLongFront * kChunkLength;
+  int front = StillPolicy::kLongFront * kChunkLength;
   while (front < share) front *= 2;
   return front / kChunkLength;
 }
@@ -42,7 +45,8 @@ struct ListCut {
   /// Most segments if all lists have `pairs`. It does not depend on room, so that the same lists are always cut alike.
   AR_HD int64_t segment_limit(int64_t pairs) const {
     if (at_least == 0) return max_segments;
-    const int64_t all = pairs / segment + pairs / at_least, few = kSegments + pairs / segment / kPairsPerSegmented;
+    const int64_t all = pairs / segment + pairs / at_least;
+    const int64_t few = MomentPolicy::kSegments + pairs / segment / MomentPolicy::kPairsPerSegmented;
     return all < few ? all : few;
   }
   /// Least pairs of a long list, if all lists have `pairs`: at_least, doubled until it is pairs / shares or more. A

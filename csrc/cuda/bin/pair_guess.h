@@ -6,7 +6,7 @@
 #include <cstdint>
 
 #include "core/stages.h"
-#include "cuda/tuning.h"
+#include "cuda/bin/policy.h"
 
 namespace ar::cuda {
 
@@ -28,7 +28,7 @@ inline int64_t in_steps(int64_t number) {
 /// A guess from earlier frames of a class of images. Too little room is slow, not wrong. The first frames are counted;
 /// later frames get the room of the largest frame so far and a reserve, in steps. More Gaussians or tiles than ever
 /// seen enlarge it in proportion. EmitParams needs room for a pair of every Gaussian.
-class PairGuess {
+class PairGuess : PairGuessPolicy {
  public:
   /// Room for frame `frame`, at most `most`; 0: count its pairs.
   int64_t capacity(uint32_t frame, int64_t gaussians, int64_t tiles, int64_t most, Counting counting) {

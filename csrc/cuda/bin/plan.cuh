@@ -2,15 +2,12 @@
 // ChunkPlan (chunk_plan.h).
 #pragma once
 
+#include "cuda/bin/policy.h"
 #include "cuda/launch.cuh"
 #include "cuda/params.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
-
-inline constexpr int kCountWorkThreads = 1024, kPlanThreads = 256;
-/// Tiles of a thread whose loads wait together.
-inline constexpr int kTilesAtOnce = 2;
 
 /// The class of a piece of work: longer work has a lower class, and begins first. The order in a class is arbitrary.
 __device__ inline int work_class(int length) { return __clz(length); }
@@ -43,20 +40,21 @@ struct PlannedTile {
 };
 
 /// Each block counts a part of the tiles. state: [1].
-__global__ void __launch_bounds__(kCountWorkThreads)
+__global__ void __launch_bounds__(PlanPolicy::kCountThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
-  static_assert(kLengthClasses < kCountWorkThreads);
+  static_assert(kLengthClasses < PlanPolicy::kCountThreads);
   __shared__ WorkSizes sizes;
   const int c = threadIdx.x;
   if (c < kLengthClasses) sizes.tiles[c] = sizes.chunks[c] = 0;
   __syncthreads();
-  const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
-  for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kTilesAtOnce * stride) {
+  const int64_t stride = int64_t(gridDim.x) * PlanPolicy::kCountThreads;
+  for (int64_t first = blockIdx.x * PlanPolicy::kCountThreads + threadIdx.x; first < tiles;
+       first += PlanPolicy::kTilesAtOnce * stride) {
     const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), cut); };
-    const PlannedTile at_once[kTilesAtOnce] = {planned(first), planned(first + stride)};
+    const PlannedTile at_once[PlanPolicy::kTilesAtOnce] = {planned(first), planned(first + stride)};
 #pragma unroll
-    for (int k = 0; k < kTilesAtOnce; ++k) {
+    for (int k = 0; k < PlanPolicy::kTilesAtOnce; ++k) {
       if (first + k * stride >= tiles) break;
       const PlannedTile& tile = at_once[k];
       const int full = tile.full(), rest = tile.rest();
@@ -78,7 +76,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
 
 /// Of class threadIdx.x; `of` chooses tiles or chunks.
 template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
-  static_assert(kLengthClasses < kPlanThreads);
+  static_assert(kLengthClasses < PlanPolicy::kThreads);
   const int c = threadIdx.x;
   int size = 0;
 #pragma unroll
@@ -96,7 +94,7 @@ struct CutClasses {
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || tile_lists.counts->in_patches(tile_lists.capacity)) return;
-    constexpr int kWarps = kPlanThreads / 32;
+    constexpr int kWarps = PlanPolicy::kThreads / 32;
     const int of_length = threadIdx.x;  // beyond the classes both sizes are 0
     const bool are_long = of_length <= __clz(cut.long_from(pairs));
     int all;
@@ -114,7 +112,7 @@ struct CutClasses {
 __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   const int c = threadIdx.x;
   int all;
-  const int first = sum_before<kPlanThreads / 32>(size, 0, all);
+  const int first = sum_before<PlanPolicy::kThreads / 32>(size, 0, all);
   if (c < kLengthClasses) begins[c] = first;
   return all;
 }
@@ -140,14 +138,14 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
 
 /// A thread per tile writes ChunkPlan, whose shapes chunk_plan.h states. Atomics hand out indices, whose order changes
 /// no result. `samples`: of a lane. `layout`: of checkpoints.
-__global__ void __launch_bounds__(kPlanThreads)
+__global__ void __launch_bounds__(PlanPolicy::kThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {
   wait_for_earlier_kernels();
   __shared__ WorkSizes begins;
   WorkSizes& placed = plan.state->placed;
   PlanCounts& counts = plan.state->counts;
-  const int64_t i = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * PlanPolicy::kThreads + threadIdx.x;
   const bool valid = i < grid.tiles();
   const auto tile = int32_t(valid ? i : 0);
   const PlannedTile planned(lists, tile, cut);

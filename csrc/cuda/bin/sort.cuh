@@ -2,16 +2,17 @@
 // is "Onesweep" of Adinets and Merrill (2022): a block adds up what earlier blocks have published.
 #pragma once
 
+#include "cuda/bin/policy.h"
 #include "cuda/launch.cuh"
-#include "cuda/tuning.h"
+#include "cuda/occupancy.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 
-template <int kBits> struct Digits : SortTuning<kBits> {
-  using SortTuning<kBits>::kThreads;
+template <int kBits> struct Digits : SortPolicy<kBits> {
+  using SortPolicy<kBits>::kThreads;
   static constexpr int kBins = 1 << kBits, kWarps = kThreads / 32;
-  static constexpr int kTile = kThreads * SortTuning<kBits>::kItems;  ///< items of a block
+  static constexpr int kTile = kThreads * SortPolicy<kBits>::kItems;  ///< items of a block
   static_assert(kThreads >= kBins && kTile < 1 << 16);
 
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
@@ -83,11 +84,11 @@ __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block,
   if (block == 0) return 0;
   uint32_t sum = 0;
   for (int64_t back = 1;;) {
-    uint32_t words[kLookBackAtOnce];
+    uint32_t words[BinPolicy::kLookBackAtOnce];
 #pragma unroll
-    for (int k = 0; k < kLookBackAtOnce; ++k) words[k] = read_status(status - min(back + k, block) * width);
+    for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) words[k] = read_status(status - min(back + k, block) * width);
 #pragma unroll
-    for (int k = 0; k < kLookBackAtOnce; ++k) {
+    for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) {
       if (words[k] == 0) break;
       sum += words[k] & kCountMask;
       if (words[k] & kUpToBlock) return sum;

@@ -4,10 +4,11 @@
 // images, `transmittance` and `last`.
 #pragma once
 
+#include "cuda/channels/policy.h"
 #include "cuda/dispatch.h"
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
 #include "cuda/tile/stage.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -154,7 +155,7 @@ template <int kBatch, int C> struct GroupChannels {
 };
 
 template <class F, int C>
-inline constexpr int kGroupBlocks = blocks_per_sm(group_blocks(F::kSamples, C == kSmallGroup), kBlendThreads);
+inline constexpr int kGroupBlocks = blocks_per_sm(ChannelsPolicy::kBlocks<F, C == kSmallGroup>, kBlendThreads);
 
 /// Block (tile, g) has channels [first_group + g C, first_group + (g + 1) C). F: what a lane blends.
 template <class F, int C>
@@ -163,8 +164,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   using Share = ChannelShare<C>;
-  __shared__ Stage<F, 0, kGroupBatch> stage;
-  __shared__ GroupChannels<kGroupBatch, C> staged;
+  __shared__ Stage<F, 0, ChannelsPolicy::kBatch> stage;
+  __shared__ GroupChannels<ChannelsPolicy::kBatch, C> staged;
   const int first = first_group + int(blockIdx.y) * C, lane = lane_id();
   const int tile = params.plan.tile_order[blockIdx.x];
   const TileList list = list_of(params.lists, params.grid, tile);
@@ -173,7 +174,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   Share sums = {};
   PixelState<S, 0, 1> state;
   state.start(pixel.inside);
-  for (int k = 0; k < list.count && __syncthreads_or(state.open()); k += kGroupBatch) {
+  for (int k = 0; k < list.count && __syncthreads_or(state.open()); k += ChannelsPolicy::kBatch) {
     const int count = stage.load(params.splats, params.channels, list, k, list.count);
     if (int(threadIdx.x) < count) staged.ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();

@@ -15,7 +15,7 @@ namespace ar::cuda {
 inline constexpr int kShapeSums = 8;
 
 template <class F, int C> struct GroupVjpShared {
-  static constexpr int kBatch = group_vjp_batch(C == kSmallGroup);
+  static constexpr int kBatch = ChannelsPolicy::kVjpBatch<C == kSmallGroup>;
 
   TileSplat<F, 0> splats[kBatch];
   GroupChannels<kBatch, C> channels;

@@ -20,14 +20,14 @@ template <class F, int C, int kSide> void launch_group(const BlendParams& p, int
 }
 
 template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream_t stream) {
-  const int64_t pieces = int64_t(p.cut.max_segments) * moving_segment(F::kSamples, kSide) / kFilterPiece;
-  const int64_t most = kFilterBlocksPerSm * multiprocessors();
+  const int64_t pieces = int64_t(p.cut.max_segments) * moving_segment(F::kSamples, kSide) / MomentPolicy::kFilterPiece;
+  const int64_t most = MomentPolicy::kFilterBlocksPerSm * multiprocessors();
   const auto blocks = unsigned(cuts_all_lists(p.grid) ? pieces : std::min(pieces, most));
-  if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
+  if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, MomentPolicy::kFilterPiece}, stream, p);
   if (p.channels.count <= kFewChannels)
     return with_few_channels(p.channels, [&](auto channels) { launch_group<F, channels, kSide>(p, 0, stream); });
-  for (int first = 0; first < p.channels.count; first += kMovingChannels)
-    launch_group<F, kMovingChannels, kSide>(p, first, stream);
+  for (int first = 0; first < p.channels.count; first += MomentPolicy::kChannels)
+    launch_group<F, MomentPolicy::kChannels, kSide>(p, first, stream);
 }
 
 }  // namespace

@@ -30,8 +30,8 @@ template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int
   if (p.channels.count <= kFewChannels)
     return with_few_channels(p.channels, [&](auto channels) { launch_group<F, channels, kSide>(p, 0, stream); });
   const int end = std::min(first_of_group + kChannelGroup, p.channels.count);
-  for (int first = first_of_group; first < end; first += kMovingChannels)
-    launch_group<F, kMovingChannels, kSide>(p, first, stream);
+  for (int first = first_of_group; first < end; first += MomentPolicy::kChannels)
+    launch_group<F, MomentPolicy::kChannels, kSide>(p, first, stream);
 }
 
 }  // namespace
@@ -47,7 +47,7 @@ int64_t max_group_sums(int footprint, const Channels<float>& channels, const Lis
       with_few_channels(channels,
                         [&](auto count) { numbers = group_sums_of<F, count, Layout, kSegment>(cut.max_segments); });
     else
-      numbers = group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
+      numbers = group_sums_of<F, MomentPolicy::kChannels, Layout, kSegment>(cut.max_segments);
   });
   return numbers;
 }

@@ -9,8 +9,9 @@
 #pragma once
 
 #include "cuda/moment/cut_lists.h"
+#include "cuda/moment/policy.h"
+#include "cuda/occupancy.h"
 #include "cuda/tile/stage.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -189,7 +190,7 @@ template <class F, class Layout> struct CellCorners {
   }
 };
 
-template <class Layout> inline constexpr int kListAhead = list_ahead(Layout::kCells);
+template <class Layout> inline constexpr int kListAhead = MomentPolicy::list_ahead(Layout::kCells);
 
 /// A batch of kBatch splats, and for each warp a list of up to kListed of them that reach its pixels. kOffsets: entries
 /// are offsets in memory, not indices.

@@ -6,6 +6,7 @@
 #include <algorithm>
 
 #include "cuda/bin/chunk_plan.h"
+#include "cuda/moment/policy.h"
 
 namespace ar::cuda {
 
@@ -26,7 +27,9 @@ struct ListSegment {
 };
 
 /// Pairs of a segment where `samples` samples move, in tiles of side x side pixels.
-AR_HD constexpr int moving_segment(int samples, int side) { return segment_length(samples, side < kMovingTile); }
+AR_HD constexpr int moving_segment(int samples, int side) {
+  return MomentPolicy::segment_length(samples, side < kMovingTile);
+}
 
 /// In small images the longest list sets the time. Tiles of 4x4 pixels are many, with short lists.
 inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
@@ -35,12 +38,13 @@ inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid, int multiprocessors) {
   const int length = moving_segment(samples, grid.side()), tiles = int(grid.tiles());
   const int64_t segments = capacity / length;
-  if (cuts_all_lists(grid)) return {true, 0, 1, length, int(segments + tiles), tiles, longest_list(samples)};
-  if (capacity < kLongList) return {true};
-  ListCut cut = {true, kLongList, kListBlocksPerSm * multiprocessors, length};
-  cut.longest_from = longest_list(samples);
+  if (cuts_all_lists(grid))
+    return {true, 0, 1, length, int(segments + tiles), tiles, MomentPolicy::longest_list(samples)};
+  if (capacity < MomentPolicy::kLongList) return {true};
+  ListCut cut = {true, MomentPolicy::kLongList, MomentPolicy::kListBlocksPerSm * multiprocessors, length};
+  cut.longest_from = MomentPolicy::longest_list(samples);
   cut.max_segments = int(cut.segment_limit(capacity));
-  cut.max_lists = std::min(cut.max_segments / (kLongList / length), tiles);
+  cut.max_lists = std::min(cut.max_segments / (MomentPolicy::kLongList / length), tiles);
   return cut;
 }
 

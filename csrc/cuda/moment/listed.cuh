@@ -13,7 +13,7 @@
 
 namespace ar::cuda {
 
-inline constexpr int kFilterWords = kFilterPiece / 32;
+inline constexpr int kFilterWords = MomentPolicy::kFilterPiece / 32;
 /// Pairs whose bits a warp reads at once.
 inline constexpr int kListedBatch = 32 * 32;
 
@@ -36,19 +36,21 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
   return bits;
 }
 
-/// A block tests kFilterPiece pairs of a segment at a time, a thread each, and writes reach_words as pixel_words()
-/// says.
-template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
+/// A block tests kFilterPiece pairs of a segment at a time, a thread each, and writes reach_words as
+/// pixel_words() says.
+template <class F, int kSide>
+__global__ void __launch_bounds__(MomentPolicy::kFilterPiece) filter_kernel(const BlendParams params) {
   wait_for_earlier_kernels();  // first: moving_blend_kernel reads the plan
   let_next_kernel_begin();
+  constexpr int kPiece = MomentPolicy::kFilterPiece;
   constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide, kWords = (kPixels + 31) / 32;
-  constexpr int kPieces = moving_segment(F::kSamples, kSide) / kFilterPiece;  // of a segment
+  constexpr int kPieces = moving_segment(F::kSamples, kSide) / kPiece;  // of a segment
   __shared__ uint32_t words[kPixels][kFilterWords];
   const PlanState& plan = *params.plan.state;
   for (int number = blockIdx.x; number < plan.counts.segments * kPieces; number += gridDim.x) {
     const ListSegment segment(plan, params.plan.chunk_order, number / kPieces);
     const TileList list = list_of(params.lists, params.grid, segment.tile);
-    const int piece = segment.index * kPieces + number % kPieces, k = piece * kFilterPiece + int(threadIdx.x);
+    const int piece = segment.index * kPieces + number % kPieces, k = piece * kPiece + int(threadIdx.x);
     uint32_t reach[kWords] = {};
     if (k < list.count) {
       const Support<float> support = support_of(load_splat<F>(params.splats, list.splat(k)));
@@ -66,7 +68,7 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
       if (kPixels % 32 == 0 || lane_id() < kPixels) words[32 * w + lane_id()][threadIdx.x / 32] = of_pixel;
     }
     __syncthreads();
-    for (int i = threadIdx.x; i < kPixels * kFilterWords; i += kFilterPiece) {
+    for (int i = threadIdx.x; i < kPixels * kFilterWords; i += kPiece) {
       const int pixel = i / kFilterWords, word = i % kFilterWords;
       params.reach_words[pixel_words<F, kSide>(segment.first(), list, pixel) + piece * kFilterWords + word] =
           words[pixel][word];
@@ -175,7 +177,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
   blend.write(params, first);
 }
 
-template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
+template <class F> inline constexpr int kListedWarps = MomentPolicy::listed_warps(F::kSamples);
 
 /// How pixels are spread over warps, as measured: docs/internals/log.md, "The queue" and "Tiles and the longest lists".
 template <class F, int kSide> struct ListedLayouts {
@@ -194,9 +196,9 @@ template <class F, int kSide> struct ListedLayouts {
   /// A multiple of kOfLongest: a block has the same pixels in each of its tiles. In small images moving_blend has
   /// little to do.
   static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
-    const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
-    const int64_t wanted =
-        is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kListedWarpsPerSm * multiprocessors / kWarps;
+    const int64_t longest = std::min(cut.max_lists, MomentPolicy::kLongestAtOnce), lists = cut.max_lists;
+    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers
+                                                : MomentPolicy::kListedWarpsPerSm * multiprocessors / kWarps;
     const int64_t blocks = std::min(wanted, lists * kOfLongest);
     return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
   }
@@ -230,7 +232,7 @@ __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(cons
     } else if constexpr (Layouts::kAhead) {
       blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut, list, stage.queued);
     } else if constexpr (Layouts::kWalked) {
-      if (list.count >= kLongList) {
+      if (list.count >= MomentPolicy::kLongList) {
         blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut, list, stage.listed);
       } else if (block % Layouts::kOfOthers < Layouts::Short::kBlocks) {
         blend_listed<F, C, typename Layouts::Short, kKeep, kSegment>(params, first, cut, list, stage.listed);

@@ -63,7 +63,8 @@ using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide,
 /// checkpoints within the segment. The first segment of a list needs no maps, and blend has stored its checkpoints.
 /// Reads the channels [first, first + C) (template parameters: cells.cuh).
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
-__global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
+__global__ void __launch_bounds__(Layout::kThreads,
+                                  blocks_per_sm(MomentPolicy::kMapThreads / Layout::kThreads, Layout::kThreads))
     segment_maps_kernel(const BlendVjpParams params, int first) {
   wait_for_earlier_kernels();
   using Lane = VjpLane<F, C, Layout, true>;
@@ -124,7 +125,7 @@ __global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / 
 template <class F, int kSide, int kSegment>
 __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples, kPixels = kSide * kSide;
+  constexpr int S = F::kSamples, kPixels = kSide * kSide, kAhead = MomentPolicy::kMapsAhead;
   const int index = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
   if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;  // for segment_vjp_kernel
@@ -139,12 +140,12 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   const int64_t first = cut.first;
   const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
   Adjoint adjoint = memory.template get<Adjoint>(first + segment);
-  for (; segment > 1; segment -= kMapsAhead) {
-    SegmentMap maps[kMapsAhead];
+  for (; segment > 1; segment -= kAhead) {
+    SegmentMap maps[kAhead];
 #pragma unroll
-    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
+    for (int i = 0; i < kAhead; ++i) maps[i] = memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
 #pragma unroll
-    for (int i = 0; i < kMapsAhead; ++i) {
+    for (int i = 0; i < kAhead; ++i) {
       if (segment - 1 - i < 1) return;
       adjoint = maps[i](adjoint);
       memory.put(first + segment - 1 - i, adjoint);

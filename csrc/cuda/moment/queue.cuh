@@ -81,7 +81,7 @@ template <class Layout> struct PairQueues {
   static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< by the lanes of a pixel
   static constexpr uint32_t kRoom = 2 * kAtOnce;
   using Memory = int32_t[Layout::kPixels][kRoom];
-  static_assert(sizeof(Memory) == kQueued * sizeof(int32_t));
+  static_assert(sizeof(Memory) == MomentPolicy::kQueued * sizeof(int32_t));
 
   int32_t* pairs;  ///< [kRoom] of the pixel
   const Bits* words;
@@ -128,7 +128,7 @@ template <class Layout> struct PairQueues {
 template <class F, int C> struct QueuedStage {
   TileSplat<F, C> splats[32];
   int32_t pairs[32];
-  int32_t queues[kQueued];
+  int32_t queues[MomentPolicy::kQueued];
 };
 
 /// The next splats of a pixel, one in each lane, on their way from memory to QueuedStage.

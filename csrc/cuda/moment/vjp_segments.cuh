@@ -13,16 +13,16 @@ namespace ar::cuda {
 /// Fewer warps, which claim groups.
 template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
 using ClaimedLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide,
-                                 Cells::kGroups / groups_of_warp(F::kSamples, kSide < kMovingTile), true>;
+                                 Cells::kGroups / MomentPolicy::groups_of_warp(F::kSamples, kSide < kMovingTile), true>;
 
 /// Whether sums of groups are in shared memory, else in group_sums [blocks, kGroups, kBatch, kSums].
-template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= kMostSumsInside;
-
+template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= MomentPolicy::kMostSumsInside;
 template <class F, int C, class Layout, int kSegment>
-struct SegmentVjpShared
-    : VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>> {
-  using Base = VjpBatch<F, C, Layout, std::min(kSegment, segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>>;
-  using SumsOfGroup = typename Base::SumsOfGroup;
+using SegmentBatch =
+    VjpBatch<F, C, Layout, std::min(kSegment, MomentPolicy::segment_batch(kSumsInside<Layout>)), kSumsInside<Layout>>;
+
+template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared : SegmentBatch<F, C, Layout, kSegment> {
+  using SumsOfGroup = typename SegmentBatch<F, C, Layout, kSegment>::SumsOfGroup;
   int segment;
   int next_group;
   int last;  ///< SamplesLast of all groups

@@ -17,8 +17,8 @@ namespace ar::cuda {
 
 /// Resident blocks of moving_vjp_kernel or, with kSegments, segment_vjp_kernel.
 template <int C, class Layout, bool kSegments>
-inline constexpr int kMovingVjpBlocks =
-    blocks_per_sm(std::max(moving_vjp_threads(C, Layout::kCells, kSegments) / Layout::kThreads, 1), Layout::kThreads);
+inline constexpr int kMovingVjpBlocks = blocks_per_sm(
+    std::max(MomentPolicy::vjp_threads(C, Layout::kCells, kSegments) / Layout::kThreads, 1), Layout::kThreads);
 
 /// Positions of a lane's samples before each splat of a chunk that reaches its warp. The first in_shared are in shared
 /// memory, the others in local memory.
@@ -218,7 +218,7 @@ void launch_vjp(Kernel kernel, const BlendVjpParams& p, unsigned blocks, int fir
   using Earlier = EarlierPositions<Layout>;
   const size_t all = shared_bytes_of_blocks(kMovingVjpBlocks<C, Layout, kSegments>);
   const size_t splats = all > sizeof(Shared) ? (all - sizeof(Shared)) / Earlier::kBytes : 0;
-  const int in_shared = int(std::min<size_t>(splats, kMostInShared)) / Earlier::kUnit * Earlier::kUnit;
+  const int in_shared = int(std::min<size_t>(splats, MomentPolicy::kMostInShared)) / Earlier::kUnit * Earlier::kUnit;
   launch(kernel, {blocks, Layout::kThreads, sizeof(Shared) + in_shared * Earlier::kBytes}, stream, p, first, in_shared);
 }
 

@@ -9,7 +9,8 @@
 namespace ar::cuda {
 
 template <class Layout, int C>
-inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / Layout::kThreads, 1), Layout::kThreads);
+inline constexpr int kMovingBlocks =
+    blocks_per_sm(std::max(MomentPolicy::blend_threads(C) / Layout::kThreads, 1), Layout::kThreads);
 
 /// Block b has tile plan.tile_order[b], unless its list is cut; the last block only waits
 /// (begin_beside_earlier_kernels). Writes the channels [first, first + C) of the image, and alpha. `beside`:
@@ -51,9 +52,9 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
         int shown[kCells];  // last entry that each sample shows
 #pragma unroll
         for (int i = 0; i < kCells; ++i) shown[i] = -1;
-        for (int n = 0; n < listed; n += kBetweenVotes) {
+        for (int n = 0; n < listed; n += MomentPolicy::kBetweenVotes) {
           if (!__any_sync(kAllLanes, blend.samples.open())) break;
-          stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
+          stage.lists.for_each(n, min(listed, n + MomentPolicy::kBetweenVotes), [&](uint32_t entry) {
             TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
             blend.add(splat, int(entry), shown);
           });

@@ -7,7 +7,6 @@
 #include "cuda/launch.cuh"
 #include "cuda/params.h"
 #include "cuda/project/shared.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -33,7 +32,7 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
 /// What count_depths adds to. By the first block alone.
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
-  for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
+  for (int k = threadIdx.x; k < kDepthHistogramWords; k += ProjectPolicy::kThreads) params.depth_histograms[k] = 0;
   if (threadIdx.x == 0) *params.counts = {};
 }
 
@@ -51,16 +50,17 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
 }
 
 // Cam: Camera<float> or FullCamera<float>. A thread has a Gaussian; in `project` it may have several.
-template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
+template <class Cam>
+__global__ void __launch_bounds__(ProjectPolicy::kThreads) project_kernel(const ProjectParams params) {
   wait_for_earlier_kernels();
-  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  __shared__ ShRows<Cam::kShDegree> sh_rows[ProjectPolicy::kThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
   const Cam& camera = shared_camera.load(params.camera);
   clear_counts(params);
   const Gaussians<float>& g = params.gaussians;
   ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-  for (int64_t block = blockIdx.x; block * kProjectThreads < g.n; block += gridDim.x) {
-    const int64_t i = block * kProjectThreads + threadIdx.x;
+  for (int64_t block = blockIdx.x; block * ProjectPolicy::kThreads < g.n; block += gridDim.x) {
+    const int64_t i = block * ProjectPolicy::kThreads + threadIdx.x;
     SplatRow<float> splat = {};
     Support<float> support = {};
     float depth = 0;
@@ -95,14 +95,14 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
 
 /// A thread per Gaussian. Cam: as above. Writes rows, packed rows or flags.
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
+__global__ void __launch_bounds__(ProjectPolicy::kThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
-  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  __shared__ ShRows<Cam::kShDegree> sh_rows[ProjectPolicy::kThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
   const Cam& camera = shared_camera.load(params.camera);
   const Gaussians<float>& g = params.gaussians;
   const RowOutputs<float>& to = params.rows;
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x;
   ProjectedGaussian<float> projected = {};
   SplatRow<float> splat = {};
   int radius = 0;
@@ -129,10 +129,10 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
 }
 
 /// A thread per public row. Writes a splat and what bin reads.
-__global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
+__global__ void __launch_bounds__(ProjectPolicy::kThreads) shape_rows_kernel(const ShapeRowsParams params) {
   wait_for_earlier_kernels();
   clear_counts(params);
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x;
   if (i >= params.n) return;
   ProjectedGaussian<float> projected;
   SplatRow<float> splat = {};

@@ -5,6 +5,7 @@
 #pragma once
 
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
 #include "cuda/params.h"
 #include "cuda/project/shared.cuh"
 
@@ -12,7 +13,7 @@ namespace ar::cuda {
 
 /// Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
 inline constexpr int kGradRows = 32;
-static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
+static_assert(ProjectPolicy::kThreads % kGradRows == 0 && ProjectPolicy::kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
 
 __device__ inline uint32_t lanes_with_pairs(int pairs) { return __ballot_sync(kAllLanes, pairs > 0); }
@@ -55,10 +56,11 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
     if (range.count > 0) sums.add<1>(row(i), 1);
     return sums;
   }
-  if (range.count <= kManyPairs) {
-    for (int q = 0; q < range.count; q += kRowsAtOnce) sums.add<kRowsAtOnce>(row(range.first + q), range.count - q);
+  if (range.count <= ProjectPolicy::kManyPairs) {
+    for (int q = 0; q < range.count; q += ProjectPolicy::kRowsAtOnce)
+      sums.add<ProjectPolicy::kRowsAtOnce>(row(range.first + q), range.count - q);
   }
-  for (uint32_t many = __brev(__ballot_sync(kAllLanes, range.count > kManyPairs)); many != 0;) {
+  for (uint32_t many = __brev(__ballot_sync(kAllLanes, range.count > ProjectPolicy::kManyPairs)); many != 0;) {
     const int source = take_first(many);
     const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
     SplatSums part = {};
@@ -179,16 +181,17 @@ struct StagedGrads : AddedGrads<float> {
 /// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out:
 /// GaussianGrads<float>, or StagedGrads with FromRows.
 template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
-__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks,
-                                                                 kProjectThreads))
+__global__ void __launch_bounds__(ProjectPolicy::kThreads,
+                                  blocks_per_sm(Cam::kFull ? ProjectPolicy::kFullVjpBlocks : ProjectPolicy::kVjpBlocks,
+                                                ProjectPolicy::kThreads))
     project_vjp_kernel(const typename From::Params params) {
   wait_for_earlier_kernels();
-  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
-  __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
+  __shared__ ShRows<Cam::kShDegree> sh_rows[ProjectPolicy::kThreads / 32];
+  __shared__ GaussianRows gaussian_rows[ProjectPolicy::kThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
   const From from{params};
   const Out& out = params.grads;
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x;
   const int lane = lane_id(), warp = threadIdx.x / 32;
   const int64_t first = i - lane;
   const PairRange range = i < params.gaussians.n ? from.range(i) : PairRange{0, 0};
@@ -236,12 +239,13 @@ __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(Cam::kFull ? kF
 }
 
 /// A warp takes kGradRows adjacent Gaussians at a time.
-__global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
+__global__ void __launch_bounds__(ProjectPolicy::kZeroThreads,
+                                  blocks_per_sm(ProjectPolicy::kZeroBlocks, ProjectPolicy::kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
-  const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kZeroThreads;
+  const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * ProjectPolicy::kZeroThreads;
   const auto count_of = [&](int64_t i) { return i < n ? params.ranges[i].count : 0; };
-  int64_t first = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
+  int64_t first = int64_t(blockIdx.x) * ProjectPolicy::kZeroThreads + threadIdx.x - lane_id();
   int count = count_of(first + lane_id());
   for (; first < n; first += step) {
     const uint32_t lit = lanes_with_pairs(count);
@@ -251,16 +255,18 @@ __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZero
 }
 
 /// A block per number.
-__global__ void __launch_bounds__(kSumThreads) sum_camera_grads_kernel(const CameraGradSums<float> params) {
+__global__ void __launch_bounds__(ProjectPolicy::kSumThreads)
+    sum_camera_grads_kernel(const CameraGradSums<float> params) {
   wait_for_earlier_kernels();
-  __shared__ double parts[kSumThreads];
+  constexpr int kThreads = ProjectPolicy::kSumThreads;
+  __shared__ double parts[kThreads];
   const CameraNumber<float> number = camera_number(params, int(blockIdx.x));
   if (!number.to) return;
   double sum = 0;
-  for (int64_t i = threadIdx.x; number.column >= 0 && i < params.n; i += kSumThreads)
+  for (int64_t i = threadIdx.x; number.column >= 0 && i < params.n; i += kThreads)
     sum += params.parts[i * kCameraGradWidth + number.column];
   parts[threadIdx.x] = sum;
-  for (int half = kSumThreads / 2; half > 0; half /= 2) {
+  for (int half = kThreads / 2; half > 0; half /= 2) {
     __syncthreads();
     if (threadIdx.x < half) parts[threadIdx.x] += parts[threadIdx.x + half];
   }
@@ -268,10 +274,10 @@ __global__ void __launch_bounds__(kSumThreads) sum_camera_grads_kernel(const Cam
 }
 
 /// A thread per row.
-__global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
+__global__ void __launch_bounds__(ProjectPolicy::kThreads) row_grads_kernel(const RowGradsParams params) {
   wait_for_earlier_kernels();
-  __shared__ float packed_rows[kProjectThreads * kPackedGradWidthAbsolute];
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  __shared__ float packed_rows[ProjectPolicy::kThreads * kPackedGradWidthAbsolute];
+  const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x;
   const PairRange range = i < params.n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
   Vec2<float> dL_dmean = {0, 0};
@@ -289,9 +295,10 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
     write_packed_grad(packed_rows + threadIdx.x * width, width, dL_dmean, {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy},
                       dL_dopacity, sums.color(), sums.mean_sums());
     __syncthreads();
-    const int64_t first = int64_t(blockIdx.x) * kProjectThreads;
-    const int numbers = int(min(int64_t(kProjectThreads), params.n - first)) * width;
-    for (int e = threadIdx.x; e < numbers; e += kProjectThreads) params.packed[first * width + e] = packed_rows[e];
+    const int64_t first = int64_t(blockIdx.x) * ProjectPolicy::kThreads;
+    const int numbers = int(min(int64_t(ProjectPolicy::kThreads), params.n - first)) * width;
+    for (int e = threadIdx.x; e < numbers; e += ProjectPolicy::kThreads)
+      params.packed[first * width + e] = packed_rows[e];
     return;
   }
   if (i >= params.n) return;
@@ -303,9 +310,9 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
 }
 
 /// A thread per splat.
-__global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
+__global__ void __launch_bounds__(ProjectPolicy::kThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
+  const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x, n = params.sums.n;
   const PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
   if (i >= n) return;
@@ -316,16 +323,19 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// channel_sums: [rows, C]. A splat has kSumLanes lanes, or with many pairs the block. A lane has four channels.
-template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
+/// channel_sums: [rows, C]. A splat has kLanes lanes, or with many pairs the block. A lane has four
+/// channels.
+template <int C>
+__global__ void __launch_bounds__(ProjectPolicy::kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
-  constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
-  constexpr int kAhead = kSumRowsAtOnce, kMany = kSumManyLoads * kAhead * kRows;
+  constexpr int kThreads = ProjectPolicy::kSumThreads, kLanes = ProjectPolicy::kSumLanes;
+  constexpr int kQuads = C / 4, kRows = kLanes / kQuads, kSplats = kThreads / kLanes;
+  constexpr int kAhead = ProjectPolicy::kSumRowsAtOnce, kMany = ProjectPolicy::kSumManyLoads * kAhead * kRows;
   static_assert(kRows > 0);
   __shared__ PairRange ranges[kSplats];
-  __shared__ float4 parts[kSumThreads / 32][kQuads];
-  const int t = int(threadIdx.x), quad = t % kQuads, lane = t % kSumLanes;
-  const int64_t first_splat = int64_t(blockIdx.x) * kSplats, i = first_splat + t / kSumLanes, n = params.sums.n;
+  __shared__ float4 parts[kThreads / 32][kQuads];
+  const int t = int(threadIdx.x), quad = t % kQuads, lane = t % kLanes;
+  const int64_t first_splat = int64_t(blockIdx.x) * kSplats, i = first_splat + t / kLanes, n = params.sums.n;
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
   const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
@@ -365,18 +375,18 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
   };
   const bool many = range.count > kMany;
   float4 own = sum_rows(many ? PairRange{0, 0} : range, lane / kQuads, kRows);
-  sum_lanes(own, kSumLanes);
+  sum_lanes(own, kLanes);
   if (i < n && !many && lane < kQuads) store(i, own);
-  if (lane == 0) ranges[t / kSumLanes] = range;
+  if (lane == 0) ranges[t / kLanes] = range;
   if (!__syncthreads_or(many)) return;
   for (int k = 0; k < kSplats; ++k) {
     if (ranges[k].count <= kMany) continue;
-    float4 sum = sum_rows(ranges[k], t / kQuads, kSumThreads / kQuads);
+    float4 sum = sum_rows(ranges[k], t / kQuads, kThreads / kQuads);
     sum_lanes(sum, 32);
     if (t % 32 < kQuads) parts[t / 32][quad] = sum;
     __syncthreads();
     if (t < kQuads) {
-      for (int w = 1; w < kSumThreads / 32; ++w) add(sum, parts[w][quad]);
+      for (int w = 1; w < kThreads / 32; ++w) add(sum, parts[w][quad]);
       store(first_splat + k, sum);
     }
     __syncthreads();

@@ -7,7 +7,7 @@
 #include "core/camera.h"
 #include "core/sh.h"
 #include "cuda/launch.cuh"
-#include "cuda/tuning.h"
+#include "cuda/project/policy.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
@@ -106,7 +106,8 @@ template <int kDegree> struct ShRows {
 /// A thread for each of n rows, in at most `most_blocks` blocks.
 template <class Params>
 void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream, unsigned most_blocks = ~0u) {
-  if (n > 0) launch(kernel, {std::min(blocks_of(n, kProjectThreads), most_blocks), kProjectThreads}, stream, p);
+  if (n > 0)
+    launch(kernel, {std::min(blocks_of(n, ProjectPolicy::kThreads), most_blocks), ProjectPolicy::kThreads}, stream, p);
 }
 /// By the kind of camera.
 template <class Params>

@@ -7,8 +7,8 @@ namespace ar::cuda {
 namespace {
 
 template <class F, int C, bool kMeans> void launch_kernel(const BlendVjpParams& p, cudaStream_t stream) {
-  constexpr int kWarps = vjp_warps(F::kSamples);
-  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksPerSm * multiprocessors());
+  constexpr int kWarps = StillPolicy::kVjpWarps<F>;
+  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), StillPolicy::kVjpBlocksPerSm * multiprocessors());
   launch(blend_vjp_kernel<F, C, kMeans>, {blocks, 32 * kWarps, sizeof(VjpShared<F, C>)}, stream, p);
 }
 template <class F, int C> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {

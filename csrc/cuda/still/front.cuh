@@ -14,16 +14,17 @@
 #pragma once
 
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
 #include "cuda/still/output.cuh"
+#include "cuda/still/policy.h"
 #include "cuda/still/stage.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
 /// A block per tile. F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kKeep: for a backward
 /// pass.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(front_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kFrontBlocks<F>, kBlendThreads))
     blend_front_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = kChunkLength, kSets = kKeep ? S : 1;

@@ -3,9 +3,10 @@
 #pragma once
 
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
 #include "cuda/still/output.cuh"
+#include "cuda/still/policy.h"
 #include "cuda/still/stage.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -23,8 +24,7 @@ template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const
 
 /// What each tail chunk alone lets through, without a threshold. F: what a lane blends.
 template <class F>
-__global__ void __launch_bounds__(kBlendThreads,
-                                  blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive), kBlendThreads))
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTailThroughBlocks<F>, kBlendThreads))
     tail_through_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
@@ -65,7 +65,7 @@ inline constexpr int kTailParts = kTilePixels / 32;
 /// of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
-  constexpr int kBatch = kTailLoads;
+  constexpr int kBatch = StillPolicy::kTailLoads;
   const int items = params.plan.state->counts.open_tiles * samples * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = params.open_tiles[item / (samples * kTailParts)], s = item / kTailParts % samples;
@@ -98,7 +98,7 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
 /// Channels of each tail chunk and transmittance at its end: zero if the sample had stopped before. F, C, kKeep: as in
 /// blend_front.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTailBlendBlocks<F>, kBlendThreads))
     tail_blend_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kSets = kKeep ? S : 1;
@@ -138,15 +138,15 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks
   });
 }
 
-inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
+inline constexpr int kTailSumThreads = 32 * StillPolicy::kTailSumWarps;
 
 /// Adds chunks up, and writes pixels. Samples: LaneSamples of what a
 /// lane blends. C, kKeep: as in blend_front.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = Samples::kSamples, kBatch = kKeep ? kTailLoadsKept : kTailLoads;
-  __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
+  constexpr int S = Samples::kSamples, kBatch = kKeep ? StillPolicy::kTailLoadsKept : StillPolicy::kTailLoads;
+  __shared__ float sums[StillPolicy::kTailSumWarps][C][32], lasts[StillPolicy::kTailSumWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
   const int items = params.plan.state->counts.open_tiles * kTailParts;
@@ -154,7 +154,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
     const int front = front_of(params), chunks = chunks_of(params, tile);
-    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
+    const int share = (chunks - front + StillPolicy::kTailSumWarps - 1) / StillPolicy::kTailSumWarps;
     int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // of the warp's chunks
     const int end = min(begin + share, chunks);
     if (warp == 0) begin = checkpoints.first_chunk;
@@ -185,7 +185,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
 #pragma unroll
       for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
       __syncthreads();
-      for (int w = 0; w < kTailSumWarps; ++w) {
+      for (int w = 0; w < StillPolicy::kTailSumWarps; ++w) {
         if (lasts[w][lane] != 0) last = lasts[w][lane];
 #pragma unroll
         for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
@@ -193,7 +193,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       transmittance[s] = last;
       if constexpr (kKeep) {
         Values<C> farther = times(abs(last), background);
-        for (int w = kTailSumWarps - 1; w > warp; --w) {
+        for (int w = StillPolicy::kTailSumWarps - 1; w > warp; --w) {
 #pragma unroll
           for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }

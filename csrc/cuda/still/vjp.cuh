@@ -7,22 +7,23 @@
 #pragma once
 
 #include "cuda/launch.cuh"
+#include "cuda/occupancy.h"
+#include "cuda/still/policy.h"
 #include "cuda/still/vjp_walk.cuh"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
 template <class F, int C> struct VjpShared {
   static_assert(sizeof(TileSplat<F, C>) <= 112, "a splat in use is copied to registers");
-  SharedPixels<F, C> pixels[vjp_warps(F::kSamples)];
-  VjpBatch<F, C> batches[vjp_warps(F::kSamples)];
+  SharedPixels<F, C> pixels[StillPolicy::kVjpWarps<F>];
+  VjpBatch<F, C> batches[StillPolicy::kVjpWarps<F>];
 };
 
 /// F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kMeans: with MeanSums. Each warp claims
 /// chunks until none is left.
 template <class F, int C, bool kMeans>
-__global__ void __launch_bounds__(32 * vjp_warps(F::kSamples),
-                                  blocks_per_sm(vjp_blocks(F::kSamples, F::kExpensive, C), 32 * vjp_warps(F::kSamples)))
+__global__ void __launch_bounds__(32 * StillPolicy::kVjpWarps<F>,
+                                  blocks_per_sm(StillPolicy::kVjpBlocks<F, C>, 32 * StillPolicy::kVjpWarps<F>))
     blend_vjp_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
   auto& shared = *reinterpret_cast<VjpShared<F, C>*>(dynamic_shared());

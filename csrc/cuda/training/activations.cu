@@ -6,13 +6,12 @@
 
 #include "cuda/launch.cuh"
 #include "cuda/training/training.h"
-#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = kActivateThreads, kWarps = kThreads / 32;
+constexpr int kThreads = 256, kWarps = kThreads / 32;
 
 // T: float or double. Arrays have a row for each of p.n Gaussians.
 /// block_sums: [blocks]; null: no penalty is wanted.

@@ -4,16 +4,16 @@
 
 #include "cuda/launch.cuh"
 #include "cuda/training/training.h"
-#include "cuda/tuning.h"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = kAdamThreads;
+constexpr int kThreads = 256;
+constexpr int kBytes = 16;  ///< of each array that a thread loads at once
 
 /// Numbers that a thread loads at once. T: float or double, in this file.
-template <typename T> struct alignas(kAdamBytes) Packed {
-  static constexpr int kWidth = kAdamBytes / sizeof(T);
+template <typename T> struct alignas(kBytes) Packed {
+  static constexpr int kWidth = kBytes / sizeof(T);
   T values[kWidth];
 };
 

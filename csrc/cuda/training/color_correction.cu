@@ -1,23 +1,22 @@
 // The correction of a picture's colours and its adjoint, for torch/training_cuda.cpp. Kernels `correct` and
-// `correct_vjp` have kCorrectPixels pixels for each thread. `correct_vjp` writes sums of blocks for the gradient of the
+// `correct_vjp` have kPixels pixels for each thread. `correct_vjp` writes sums of blocks for the gradient of the
 // matrix, and `sum_blocks` adds these up in a fixed order.
 #include "core/color_correction.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training/training.h"
-#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = kCorrectThreads;
+constexpr int kThreads = 256, kPixels = 8;
 
 /// Calls body(pixel) for the pixels of this thread.
 template <class Body> __device__ void for_each_pixel(int64_t pixels, const Body& body) {
 #pragma unroll
-  for (int k = 0; k < kCorrectPixels; ++k) {
-    const int64_t i = (int64_t(blockIdx.x) * kCorrectPixels + k) * kThreads + threadIdx.x;
+  for (int k = 0; k < kPixels; ++k) {
+    const int64_t i = (int64_t(blockIdx.x) * kPixels + k) * kThreads + threadIdx.x;
     if (i < pixels) body(i);
   }
 }
@@ -63,7 +62,7 @@ template <typename T> __global__ void sum_blocks_kernel(const T* block_sums, int
 
 }  // namespace
 
-int64_t correct_blocks(int64_t pixels) { return blocks_of(pixels, kThreads * kCorrectPixels); }
+int64_t correct_blocks(int64_t pixels) { return blocks_of(pixels, kThreads * kPixels); }
 
 template <typename T> void correct_colors(const CorrectParams<T>& p, cudaStream_t stream) {
   launch(correct_kernel<T>, {unsigned(correct_blocks(p.pixels)), kThreads}, stream, p);

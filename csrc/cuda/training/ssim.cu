@@ -3,24 +3,24 @@
 // a fixed order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
 //
 // A block has a tile of pixels: it copies what windows reach to shared memory, sums along rows, then along columns. A
-// thread makes kSsimRun neighbouring sums from registers, to load less from shared memory.
+// thread makes kRun neighbouring sums from registers, to load less from shared memory.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training/training.h"
-#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = kSsimThreads;
+constexpr int kThreads = 256;
 constexpr int kReach = 2 * kSsimRadius;
 
 /// The tile of a block. T: float or double, in this file.
 template <typename T> struct Tile {
-  static constexpr int kColumns = kSsimColumns;
-  static constexpr int kRun = kSsimRun<T>;  ///< pixels of a thread, in a column
+  static constexpr int kColumns = 32;
+  static constexpr int kRun =
+      sizeof(T) == 4 ? 4 : 1;  ///< pixels of a thread, in a column: loads from shared memory against registers
   static constexpr int kRows = kThreads / kColumns * kRun;
   static constexpr int kReadColumns = kColumns + kReach, kReadRows = kRows + kReach;
   // The remainder by four is three: threads with runs of four in neighbouring rows read from different banks.

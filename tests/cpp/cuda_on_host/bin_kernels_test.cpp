@@ -73,7 +73,7 @@ void expect_sorted(const std::vector<float>& depths, int passes, bool with_slots
   Counts counts = {};
   const DepthSort sort = {
       n, {keys[0].data(), keys[1].data()}, {order[0].data(), order[1].data()}, ranges.data(), with_slots, &counts};
-  cuda_on_host::launch(2, kCountThreads, [&] {
+  cuda_on_host::launch(2, BinPolicy::kCountThreads, [&] {
     count_depths_kernel(sort.keys[0], sort.ranges, with_slots, n, scratch.histograms, sort.counts,
                         memory_from(memory, kDepthHistogramWords), memory_from(other, 0));
   });
@@ -132,7 +132,7 @@ TEST(BinKernels, CountsMorePairsThanAnIntHolds) {
   for (const bool with_slots : {false, true}) {
     std::vector<uint32_t> histograms(kDepthHistogramWords);
     Counts counts = {};
-    cuda_on_host::launch(1, kCountThreads, [&] {
+    cuda_on_host::launch(1, BinPolicy::kCountThreads, [&] {
       count_depths_kernel(keys.data(), ranges.data(), with_slots, 32, histograms.data(), &counts, {}, {});
     });
     EXPECT_EQ(counts.pairs, int64_t(1) << 32);
@@ -243,7 +243,7 @@ bool is_subsequence(const std::vector<int>& some, const std::vector<int>& all) {
 /// Splats and what bin makes of them before it writes pairs.
 struct ToEmit {
   static constexpr TileGrid kGrid = {170, 700};
-  static constexpr int n = kEmitSplats + kEmitThreads + 30;
+  static constexpr int n = BinPolicy::kEmitSplats + BinPolicy::kEmitThreads + 30;
 
   const int footprint = find_footprint("mip");
   const std::vector<SplatRow<float>> splats = random_splats(n, kGrid);
@@ -298,9 +298,9 @@ struct Emitted {
     emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
     emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
     // One block more than has splats, as where some are culled.
-    cuda_on_host::launch((from.n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
+    cuda_on_host::launch((from.n + BinPolicy::kEmitSplats - 1) / BinPolicy::kEmitSplats + 1, BinPolicy::kEmitThreads,
                          [&] { emit_pairs_kernel(emit, from.digits); });
-    cuda_on_host::launch(2, kEmitThreads, [&] { emit_long_pairs_kernel(emit, from.digits); });
+    cuda_on_host::launch(2, BinPolicy::kEmitThreads, [&] { emit_long_pairs_kernel(emit, from.digits); });
     tiles.resize(counts.listed);
     std::vector<uint32_t> expected_counts(counts_of_digits.size());
     for (const uint32_t tile : tiles) {
@@ -395,7 +395,7 @@ TEST(BinKernels, FirstPairsOfTiles) {
         expected.push_back(std::lower_bound(tiles.begin(), tiles.end(), uint32_t(tile)) - tiles.begin());
       const Counts counts = {pairs + 7, pairs, pairs};
       uint64_t word = 0;
-      cuda_on_host::launch(tile_count / kOffsetTiles + 1, kOffsetTiles * kOffsetLanes,
+      cuda_on_host::launch(tile_count / BinPolicy::kOffsetTiles + 1, BinPolicy::kOffsetTiles * BinPolicy::kOffsetLanes,
                            [&] { tile_offsets_kernel(tiles.data(), &counts, tile_count, offsets.data(), {&word, 3}); });
       EXPECT_EQ(offsets, expected) << tile_count << " tiles, " << pairs << " pairs";
       EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs + 7));

@@ -112,14 +112,14 @@ template <class F, int C> struct Scene {
     params.chunks_taken = &taken;
     params.pair_grads = sums.data();
     for (float4& numbers : dynamic_memory) numbers = {NAN, NAN, NAN, NAN};
-    cuda_on_host::launch(blocks, 32 * vjp_warps(S), [&] { blend_vjp_kernel<F, C, kMeans>(params); });
+    cuda_on_host::launch(blocks, 32 * StillPolicy::kVjpWarps<F>, [&] { blend_vjp_kernel<F, C, kMeans>(params); });
     return taken - first;
   }
 };
 
 template <class F, bool kMeans> void expect_the_same_from_few_warps(bool overflow) {
   SCOPED_TRACE(testing::Message() << F::kSamples << " samples, MeanSums " << kMeans << ", overflow " << overflow);
-  constexpr int kBlocks = 2, kWarps = kBlocks * vjp_warps(F::kSamples);
+  constexpr int kBlocks = 2, kWarps = kBlocks * StillPolicy::kVjpWarps<F>;
   constexpr int kColumns = kMeans ? kPairMeans + 2 : kPairMeans;
   Scene<F, 3> scene(kMeans ? MeanSums::kNorm : MeanSums::kNone, overflow);
   const int end = int(scene.chunks.size());

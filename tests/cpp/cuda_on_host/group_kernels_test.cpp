@@ -282,11 +282,11 @@ TYPED_TEST(GroupKernels, GiveTheSameBitsOfImagesInGroupsOf8AndOf32) {
 TYPED_TEST(GroupKernels, GiveWhatCompositingGivesInSeveralBatches) {
   using F = TypeParam;
   const Scene<F> scene(262, F::kSamples > 1 ? 40 : 72, 0.05f, -0.8f);
-  ASSERT_GT(scene.splats.size(), 2 * kGroupBatch);
+  ASSERT_GT(scene.splats.size(), 2 * ChannelsPolicy::kBatch);
   Way way;
   if (F::kSamples > 1) way.mean_sums = MeanSums::kNorm;
   const Results results = Run<F>(scene, way).out;
-  EXPECT_GT(*std::max_element(results.last.begin(), results.last.end()), 2 * kGroupBatch);
+  EXPECT_GT(*std::max_element(results.last.begin(), results.last.end()), 2 * ChannelsPolicy::kBatch);
   expect_near(results, reference(scene, way.mean_sums));
 }
 
@@ -325,8 +325,9 @@ template <int C> void sum_channels_of(const std::vector<int>& pairs_of_splats, i
   params.width = C, params.first = first, params.count = count;
   params.dL_dchannels = out.data();
   params.stride = stride;
-  const int of_block = kSumThreads / kSumLanes;
-  cuda_on_host::launch((int(n) + of_block - 1) / of_block, kSumThreads, [&] { sum_channels_kernel<C>(params); });
+  const int of_block = ProjectPolicy::kSumThreads / ProjectPolicy::kSumLanes;
+  cuda_on_host::launch((int(n) + of_block - 1) / of_block, ProjectPolicy::kSumThreads,
+                       [&] { sum_channels_kernel<C>(params); });
   for (size_t i = 0; i < out.size(); ++i) {
     if (std::isnan(expected[i])) {
       EXPECT_TRUE(std::isnan(out[i])) << i;

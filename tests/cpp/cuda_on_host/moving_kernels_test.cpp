@@ -71,9 +71,9 @@ struct Plan {
     view.tile_planes = planes.data();
     view.cut_lists = lists.data();
     view.blocks_at_once = kBlocksPerSm * cuda_on_host::kMultiprocessors;
-    cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
+    cuda_on_host::launch(PlanState::kCounters, PlanPolicy::kCountThreads,
                          [&] { count_work_kernel(scene.lists, scene.grid.tiles(), cut, &state); });
-    cuda_on_host::launch(1, kPlanThreads,
+    cuda_on_host::launch(1, PlanPolicy::kThreads,
                          [&] { plan_kernel(scene.lists, scene.grid, F::kSamples, cut, {kColors, true}, view); });
   }
 };
@@ -82,7 +82,7 @@ struct Plan {
 /// cut: forwards into lists of pixels, those of `longest_from` with a warp or more for each pixel; back into segments
 /// of so many pairs.
 template <class F, class Forward, class Backward, int kSegment = 0>
-Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(F::kSamples)) {
+Results run(Scene<F>& scene, int long_from = 0, int longest_from = MomentPolicy::longest_list(F::kSamples)) {
   constexpr int S = F::kSamples, kSide = Forward::kSide;
   static_assert(Backward::kSide == kSide);
   const int tiles = int(scene.grid.tiles());
@@ -118,7 +118,7 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(
     constexpr bool kKeep = decltype(keep)::value;
     if constexpr (kSegment > 0) {
       // Fewer blocks than pieces and tiles.
-      cuda_on_host::launch(cut.max_segments / 2, kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
+      cuda_on_host::launch(cut.max_segments / 2, MomentPolicy::kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
       cuda_on_host::launch(ListedLayouts<F, kSide>::kOfLongest, 32 * kListedWarps<F>,
                            [&] { listed_blend_kernel<F, kColors, kSide, kKeep, kSegment>(p, 0); });
     }
@@ -278,13 +278,13 @@ template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
   using Even = EvenLayout<F, kSide>;
   Scene<F> scene(1100, 70, 0.1f, grid);
   const Results whole = run<F, Even, Even>(scene);
-  EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), std::max(kListedBatch, kQueued));
+  EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), std::max(kListedBatch, MomentPolicy::kQueued));
   const Results short_lists = run<F, Even, Even, 64>(scene);
   expect_same(short_lists, whole);
   expect_same(run<F, Even, Even, moving_segment(F::kSamples, kSide)>(scene), whole);
   // The long list alone, beside others that are not cut.
   expect_same(run<F, Even, Even, 64>(scene, 1024), whole);
-  if (longest_list(F::kSamples) == 0) return;  // all were among the longest
+  if (MomentPolicy::longest_list(F::kSamples) == 0) return;  // all were among the longest
   const Results a_long_list = run<F, Even, Even, 64>(scene, 0, 512);
   // Colours are added up by other lanes.
   for (size_t i = 0; i < a_long_list.image.size(); ++i)

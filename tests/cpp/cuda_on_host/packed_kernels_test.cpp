@@ -11,7 +11,7 @@
 namespace ar::cuda {
 namespace {
 
-constexpr int kCount = 3 * kProjectThreads + 21, kBlocks = 4, kCoefficients = 4, kDegree = 1;
+constexpr int kCount = 3 * ProjectPolicy::kThreads + 21, kBlocks = 4, kCoefficients = 4, kDegree = 1;
 using Cam = Camera<float>;
 
 std::vector<float> random_numbers(size_t count, float low, float high, int seed) {
@@ -73,7 +73,7 @@ struct Rows {
 };
 
 void project(const ProjectRowsParams& p) {
-  cuda_on_host::launch(kBlocks, kProjectThreads, [&] { project_rows_kernel<Cam>(p); });
+  cuda_on_host::launch(kBlocks, ProjectPolicy::kThreads, [&] { project_rows_kernel<Cam>(p); });
 }
 
 /// Packed rows, as they are counted and written, behind a place that is left for others.
@@ -180,7 +180,7 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
       p.kept_covs = covs.data();
       p.kept_opacities = opacities.data();
     }
-    cuda_on_host::launch(kBlocks, kProjectThreads, [&] { shape_rows_kernel(p); });
+    cuda_on_host::launch(kBlocks, ProjectPolicy::kThreads, [&] { shape_rows_kernel(p); });
     EXPECT_EQ(counts.pairs, 0);
     EXPECT_EQ(counts.splats, 0);
     EXPECT_EQ(histograms.back(), 7u);
@@ -199,7 +199,7 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
 }
 
 TEST(PackedKernels, GradientsOfRowsAreThoseOfSeparateColumns) {
-  constexpr int kRows = kProjectThreads + 37, kPairs = 3;
+  constexpr int kRows = ProjectPolicy::kThreads + 37, kPairs = 3;
   Rows rows(kRows), expected(kRows);
   rows.cov2d = random_numbers(3 * kRows, 1, 2, 1);
   rows.opacities = random_numbers(kRows, 0.1f, 1, 2);
@@ -216,7 +216,7 @@ TEST(PackedKernels, GradientsOfRowsAreThoseOfSeparateColumns) {
   RowGradsParams p = {};
   p.n = kRows;
   p.sums = {kRows, ranges.data(), &counts, kPairs * kRows, pairs.data()};
-  const auto run = [&] { cuda_on_host::launch(2, kProjectThreads, [&] { row_grads_kernel(p); }); };
+  const auto run = [&] { cuda_on_host::launch(2, ProjectPolicy::kThreads, [&] { row_grads_kernel(p); }); };
   p.rows = rows.view();
   const ProjectedRows<float> to = expected.view();
   p.dL_dmeans2d = to.means2d, p.dL_dcov2d = to.cov2d, p.dL_dopacities = to.opacities;
@@ -290,7 +290,7 @@ TEST(PackedKernels, GradientsOfCamerasAreAdded) {
   const auto run = [&](Gradients& to, const std::vector<int32_t>& of_rows, bool add) {
     p.grads = to.view();
     p.rows.places.rows = of_rows.data();
-    cuda_on_host::launch(kBlocks, kProjectThreads, [&] {
+    cuda_on_host::launch(kBlocks, ProjectPolicy::kThreads, [&] {
       add ? project_vjp_kernel<Cam, FromRows, StagedGrads>(p) : project_vjp_kernel<Cam, FromRows>(p);
     });
   };

@@ -16,7 +16,7 @@ namespace {
 
 /// Blocks that a device works on at once, and those of which each has a share of all pairs.
 constexpr int kManyBlocks = kBlocksPerSm * cuda_on_host::kMultiprocessors;
-constexpr int kListBlocks = kListBlocksPerSm * cuda_on_host::kMultiprocessors;
+constexpr int kListBlocks = MomentPolicy::kListBlocksPerSm * cuda_on_host::kMultiprocessors;
 static_assert(kManyBlocks == 1056 && kListBlocks == 528);  // for which the cases below are made
 
 struct Case {
@@ -75,9 +75,9 @@ void expect_planned(const Case& c, int samples = 4) {
   ChunkPlan plan = {
       &state,           chunk_order.data(), tile_order.data(), tile_planes.data(), whole ? nullptr : tail.data(),
       cut_lists.data(), kManyBlocks};
-  cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
+  cuda_on_host::launch(PlanState::kCounters, PlanPolicy::kCountThreads,
                        [&] { count_work_kernel(lists, tiles, c.cut, &state); });
-  cuda_on_host::launch((tiles + kPlanThreads - 1) / kPlanThreads, kPlanThreads,
+  cuda_on_host::launch((tiles + PlanPolicy::kThreads - 1) / PlanPolicy::kThreads, PlanPolicy::kThreads,
                        [&] { plan_kernel(lists, c.grid, samples, c.cut, layout, plan); });
 
   std::set<std::pair<int, int>> expected_tail;
@@ -163,7 +163,7 @@ TEST(PlanKernels, LongLists) { expect_planned({kSmall, 30000, true, kChunks}); }
 TEST(PlanKernels, LongListsWithoutBackward) { expect_planned({kSmall, 30000, false, kChunks}); }
 TEST(PlanKernels, ManyTiles) {
   // Threads of count_work go on to further tiles.
-  ASSERT_GT(kLarge.tiles(), kTilesAtOnce * PlanState::kCounters * kCountWorkThreads);
+  ASSERT_GT(kLarge.tiles(), PlanPolicy::kTilesAtOnce * PlanState::kCounters * PlanPolicy::kCountThreads);
   expect_planned({kLarge, 900, true, kChunks});
 }
 TEST(PlanKernels, LongListsOfManyTiles) {
@@ -223,11 +223,11 @@ TEST(PlanKernels, HaveRoomForTheSegmentsOfLongLists) {
   EXPECT_GE(small.max_segments, 100000 / small.segment + kSmall.tiles());
   EXPECT_EQ(small.max_lists, kSmall.tiles());
   // In a large one none if none can be long; all as long as they are few; and always those of a quarter of the pairs.
-  EXPECT_EQ(list_cut(4, kLongList - 1, kLarge).max_segments, 0);
+  EXPECT_EQ(list_cut(4, MomentPolicy::kLongList - 1, kLarge).max_segments, 0);
   for (const int samples : {1, 16}) {
-    const int segment = moving_segment(samples, kLarge.side()), of_long_list = kLongList / segment;
-    const ListCut few = list_cut(samples, 3 * (kLongList + 1), kLarge);
-    EXPECT_EQ(few.long_from(3 * (kLongList + 1)), kLongList);
+    const int segment = moving_segment(samples, kLarge.side()), of_long_list = MomentPolicy::kLongList / segment;
+    const ListCut few = list_cut(samples, 3 * (MomentPolicy::kLongList + 1), kLarge);
+    EXPECT_EQ(few.long_from(3 * (MomentPolicy::kLongList + 1)), MomentPolicy::kLongList);
     EXPECT_GE(few.max_segments, 3 * (of_long_list + 1));
     EXPECT_GE(few.max_lists, 3);
     const int64_t pairs = 100000000;

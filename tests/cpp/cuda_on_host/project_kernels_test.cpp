@@ -14,7 +14,7 @@ namespace {
 
 constexpr int kWidth = 64, kHeight = 48;
 /// Two blocks; the last warp is not full.
-constexpr int kCount = kProjectThreads + 50;
+constexpr int kCount = ProjectPolicy::kThreads + 50;
 
 struct Case {
   const char* name;
@@ -140,7 +140,7 @@ TEST_P(ProjectKernel, WritesWhatTheCoreGives) {
   p.counts = &counts;
   p.depth_histograms = histograms.data();
   // A single block, which takes all Gaussians in turns.
-  cuda_on_host::launch(1, kProjectThreads, [&] { project_kernel<Camera<float>>(p); });
+  cuda_on_host::launch(1, ProjectPolicy::kThreads, [&] { project_kernel<Camera<float>>(p); });
   EXPECT_EQ(histograms, std::vector<uint32_t>(histograms.size()));
   EXPECT_EQ(counts.pairs + counts.splats, 0);
 
@@ -176,7 +176,7 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   int pairs = 0;
   for (int i = 0; i < kCount; ++i) {
     const bool seen = i / 32 != 1 && numbers.bits() % 3 > 0;
-    const int count = i == 40 + 60 ? kManyPairs + 11 : seen ? 1 + int(numbers.bits() % 9) : 0;
+    const int count = i == 40 + 60 ? ProjectPolicy::kManyPairs + 11 : seen ? 1 + int(numbers.bits() % 9) : 0;
     ranges.push_back({pairs, count});
     pairs += count;
   }
@@ -191,13 +191,13 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   p.sums = {kCount, ranges.data(), &counts, c.more_pairs_than_room ? 1 : pairs, pair_grads.data()};
   const Outputs results(g), expected(g);
   p.grads = results.grads;
-  cuda_on_host::launch((kCount + kProjectThreads - 1) / kProjectThreads, kProjectThreads,
+  cuda_on_host::launch((kCount + ProjectPolicy::kThreads - 1) / ProjectPolicy::kThreads, ProjectPolicy::kThreads,
                        [&] { project_vjp_kernel<Camera<float>>(p); });
   // What project_vjp leaves out, and only that: one block, which goes on to the last warps.
   Outputs zeros(g);
   const auto zero = [&](const Outputs& out) {
     const ZeroGradsParams to_zero = {g, out.grads, ranges.data()};
-    cuda_on_host::launch(1, kZeroThreads, [&] { zero_culled_grads_kernel(to_zero); });
+    cuda_on_host::launch(1, ProjectPolicy::kZeroThreads, [&] { zero_culled_grads_kernel(to_zero); });
   };
   zero(zeros);
   for (int i = 0; i < kCount; ++i) {
@@ -242,7 +242,7 @@ TEST(ZeroCulledGrads, GoesThroughAllGroups) {
     p.gaussians.n = n;
     p.grads.opacities = opacities.data();
     p.ranges = ranges.data();
-    cuda_on_host::launch(1, kZeroThreads, [&] { zero_culled_grads_kernel(p); });
+    cuda_on_host::launch(1, ProjectPolicy::kZeroThreads, [&] { zero_culled_grads_kernel(p); });
     for (int i = 0; i < n; ++i) {
       const auto begin = ranges.begin() + i / 32 * 32, end = ranges.begin() + std::min(n, i / 32 * 32 + 32);
       const bool shown = std::any_of(begin, end, [](PairRange r) { return r.count > 0; });

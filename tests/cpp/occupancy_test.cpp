@@ -1,4 +1,6 @@
-#include "cuda/tuning.h"
+#include "cuda/occupancy.h"
+#include "cuda/bin/policy.h"
+#include "cuda/project/policy.h"
 
 #include <gtest/gtest.h>
 
@@ -18,14 +20,14 @@ struct Bound {
   int blocks, threads;
 };
 constexpr Bound kBounds[] = {
-    {"sort_pass_kernel<7>", SortTuning<7>::kBlocks, SortTuning<7>::kThreads},
-    {"sort_pass_kernel<8>", SortTuning<8>::kBlocks, SortTuning<8>::kThreads},
-    {"sort_pass_kernel<9>", SortTuning<9>::kBlocks, SortTuning<9>::kThreads},
-    {"project_vjp_kernel", kProjectVjpBlocks, kProjectThreads},
-    {"zero_culled_grads_kernel", kZeroBlocks, kZeroThreads},
+    {"sort_pass_kernel<7>", SortPolicy<7>::kBlocks, SortPolicy<7>::kThreads},
+    {"sort_pass_kernel<8>", SortPolicy<8>::kBlocks, SortPolicy<8>::kThreads},
+    {"sort_pass_kernel<9>", SortPolicy<9>::kBlocks, SortPolicy<9>::kThreads},
+    {"project_vjp_kernel", ProjectPolicy::kVjpBlocks, ProjectPolicy::kThreads},
+    {"zero_culled_grads_kernel", ProjectPolicy::kZeroBlocks, ProjectPolicy::kZeroThreads},
 };
 
-TEST(TuningTest, LaunchBoundsAreInRangeOnEveryDevice) {
+TEST(OccupancyTest, LaunchBoundsAreInRangeOnEveryDevice) {
   for (const Device& device : kDevices) {
     EXPECT_EQ(resident_threads(device.architecture), device.threads);
     for (const Bound& bound : kBounds) {
@@ -36,7 +38,7 @@ TEST(TuningTest, LaunchBoundsAreInRangeOnEveryDevice) {
   }
 }
 
-TEST(TuningTest, LaunchBoundsAreClampedOnlyWhereTheyMustBe) {
+TEST(OccupancyTest, LaunchBoundsAreClampedOnlyWhereTheyMustBe) {
   EXPECT_EQ(blocks_per_sm(16, 128, 900), 16);
   EXPECT_EQ(blocks_per_sm(16, 128, 860), 12);
   EXPECT_EQ(blocks_per_sm(16, 128, 750), 8);
@@ -45,7 +47,7 @@ TEST(TuningTest, LaunchBoundsAreClampedOnlyWhereTheyMustBe) {
   EXPECT_EQ(blocks_per_sm(2, 1024, 750), 1);
 }
 
-TEST(TuningTest, UnknownDevicesGetBoundsThatAreInRangeOnAll) { EXPECT_EQ(resident_threads(9999), 1024); }
+TEST(OccupancyTest, UnknownDevicesGetBoundsThatAreInRangeOnAll) { EXPECT_EQ(resident_threads(9999), 1024); }
 
 }  // namespace
 }  // namespace ar::cuda
