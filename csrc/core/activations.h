@@ -1,6 +1,5 @@
-// From the parameters that a training optimises to the rasterizer's: exp of scales, unit quaternions, the logistic
-// function of opacities; and the 3D filter that widens Gaussians. The adjoints compute the values again.
-// cpu/activations.cpp and cuda/training/activations.cu run all of them.
+// From the parameters that a training optimises to the rasterizer's: exp of scales, unit quaternions, sigmoid of
+// opacities; and the 3D filter that widens Gaussians. The adjoints compute the values again.
 #pragma once
 
 #include <cmath>
@@ -13,7 +12,7 @@ namespace ar {
 /// The least divisor of a quaternion, as in torch.nn.functional.normalize.
 inline constexpr double kMinQuaternionLength = 1e-12;
 
-/// Of a penalty on opacities and scales: weighted sums over all Gaussians, and over the axes of each.
+/// Of a penalty: weighted sums over all Gaussians, and over the axes of each.
 template <typename T> struct PenaltyWeights {
   T opacity, scale;
 };
@@ -89,7 +88,6 @@ template <typename T> AR_HD Vec4<T> rotation_of_vjp(Vec4<T> q, Vec4<T> g) {
           (g.w - along * r.w) / length};
 }
 
-/// Returns what the Gaussian adds to the penalty.
 template <typename T> AR_HD T activate(const ActivateParams<T>& p, int64_t i) {
   const Vec3<T> s = p.scales[i] = scale_of(p.log_scales[i]);
   p.rotations[i] = rotation_of(p.quats[i]);
@@ -132,8 +130,7 @@ template <typename T> AR_HD FilteredAxis<T> filter_axis(T s, T width) {
   return {scale, s / scale, width / scale};
 }
 
-/// The covariance gains width^2 along every axis; the opacity falls with the peak, which keeps the mass [Mip-Splatting,
-/// Eq. 9].
+/// The covariance gains width^2; the opacity falls with the peak, which keeps the mass [Mip-Splatting, Eq. 9].
 template <typename T> AR_HD void apply_filter(const FilterParams<T>& p, int64_t i) {
   const Vec3<T> s = p.scales[i];
   const T width = p.widths[i];

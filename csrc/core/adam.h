@@ -1,5 +1,5 @@
 // A step of Adam [Kingma and Ba 2015, Algorithm 1] for several tensors, each with its own learning rate and count of
-// steps. Epsilon is outside the root, as in torch.optim.Adam. cpu/adam.cpp and cuda/training/adam.cu run the work items.
+// steps. Epsilon is outside the root, as in torch.optim.Adam.
 #pragma once
 
 #include <cmath>

@@ -1,6 +1,6 @@
-// Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for boxes of
-// pixels (docs/internals/numerics.md, "Extents of the support"). project.h culls by the extents. cpu/bin.h finds
-// the tiles of a splat, on CUDA `project` does. Blending tests boxes. The keys of the sort by depth are here too.
+// Which pixels and tiles a splat can touch: Support, the ellipse of a splat with exact extents, and BoxReach, a cheaper
+// test for boxes of pixels (docs/internals/numerics.md, "Extents of the support"). Extents cull splats and find their
+// tiles, blending tests boxes. depth_bits() makes the keys of the sort by depth.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -77,8 +77,8 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// Whether a support reaches boxes of one size, without division and root. In z = w (x - mean) the ellipse is a circle,
-/// compared with a bounding box of the box of pixels. It may say yes if the ellipse passes closely.
+/// Whether a support reaches boxes of one size, without division and root: in z = w (x - mean) the ellipse is a circle,
+/// compared with a bounding box of the box. It may say yes if the ellipse passes closely.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
@@ -107,7 +107,6 @@ template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {
   return {int(std::ceil(lo)), int(std::floor(hi))};
 }
 
-/// Whether the bounding box contains a pixel centre.
 template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid grid) {
   const T half = s.half_width + s.reach;
   const Range rows = clamp_range(rows_of(s), grid.height);
@@ -133,7 +132,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// As unsigned integers the bits of depths >= 0 sort as the depths do. -0 counts as 0.
+/// Sort as unsigned integers as depths >= 0 do. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
@@ -145,7 +144,7 @@ template <typename T> AR_HD auto depth_bits(T depth) {
 /// Tiles among 8x8: bit 8 r + c is row r, column c.
 using TileMask = uint64_t;
 
-/// The tiles that a support touches. The mask begins at `row` and `column`.
+/// The mask begins at `row` and `column`.
 struct TileBox {
   TileMask mask;  ///< 0 if there is no tile, or one outside these 8x8
   int row, column, count;

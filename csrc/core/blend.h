@@ -1,6 +1,6 @@
-// Front-to-back compositing of one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and
-// its adjoint"). A library for the loops of cpu/ and cuda/. For samples that move, map_placed_sample makes the
-// AdjointMap of a segment. mean_sums_of makes a pixel's part of MeanSums.
+// Compositing one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its adjoint"). For
+// samples that move, map_placed_sample makes the AdjointMap of a segment. mean_sums_of makes a pixel's part of
+// MeanSums.
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.
@@ -32,7 +32,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
   const MaskOf<V> hit = raw >= V(T(kAlphaMin));
-  // Two forms with the same bits: the first is quicker for a GPU thread, the second for packs.
+  // The same bits: the first is quicker for a GPU thread, the second for packs.
   if constexpr (std::is_same_v<MaskOf<V>, bool>) {
     const V if_shown = transmittance * min(raw, V(T(kAlphaMax))), next = transmittance - if_shown;
     const bool mask = hit & (next >= V(T(kTransmittanceMin)));
@@ -81,8 +81,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// Repeats blend_placed_sample in the backward pass, and returns the mask. `before`: not later than the last splat
-/// composited, so kTransmittanceMin need not be tested.
+/// Repeats blend_placed_sample in the backward pass. `before`: not later than the last splat composited, so
+/// kTransmittanceMin need not be tested.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
@@ -101,9 +101,9 @@ template <class V> struct BlendGrad {
 
 /// Adjoint of blend_sample, called from the last splat to the first.
 ///
-/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of
-/// docs/internals/numerics.md) is that product for all later splats and the background, seen through this splat alone.
-/// `transmittance` and `behind` are read as after the splat, written as before it.
+/// `g_color`: the pixel's gradient times the splat's colour. `behind` (B of docs/internals/numerics.md) is that product
+/// for all later splats and the background, seen through this splat alone. `transmittance` and `behind` are read as
+/// after the splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -153,7 +153,6 @@ template <class V> struct AdjointMap {
   Mat2<V> of_place;
 };
 
-/// Appends one splat to the segment.
 template <class P, class Terms, class V, class Cell>
 AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mask, const Cell& cell, V g_color,
                              V& transmittance, Vec2<V>& place, AdjointMap<V>& map) {
@@ -177,7 +176,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
        select(slope.free_y, yy, zero)};
 }
 
-/// What a pixel adds to the two sums. dL_dmean: the pixel's share of the gradient [1/px].
+/// dL_dmean: the pixel's share of the gradient [1/px].
 template <class V, typename T> AR_HD Vec2<V> mean_sums_of(MeanSums sums, Vec2<T> size, Vec2<V> dL_dmean) {
   if (sums == MeanSums::kAbsolute) return {abs(dL_dmean.x), abs(dL_dmean.y)};
   const V x = V(T(0.5) * size.x) * dL_dmean.x, y = V(T(0.5) * size.y) * dL_dmean.y;

@@ -1,5 +1,5 @@
 // Adds the Blur of lens and shutter to a projected covariance, and lowers the amplitude so that the splat keeps its
-// mass. project.h calls seen_covariance and its adjoint.
+// mass.
 #pragma once
 
 #include "core/covariance.h"

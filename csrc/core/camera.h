@@ -1,7 +1,6 @@
-// What project.h, covariance.h and blur.h ask of a camera with any model: a mean's pixel, the Jacobian there, the blur,
-// and the adjoints. The models are in core/camera/. Most functions are compiled for two types. Camera is the pinhole of
-// 3DGS. FullCamera has all models and effects as branches, which all threads take alike: projecting is a small part of
-// a frame.
+// A camera of any model: a mean's pixel, the Jacobian there, the blur, and the adjoints. The models are in
+// core/camera/. Most functions are compiled for two types: Camera is the pinhole of 3DGS, FullCamera has all models and
+// effects as branches, which all threads take alike.
 #pragma once
 
 #include "core/defocus.h"
@@ -144,7 +143,7 @@ AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>&
   return by_view;
 }
 
-/// Gradients by the numbers that users give of a camera, from CameraGrads of parts of the Gaussians.
+/// From CameraGrads of parts of the Gaussians.
 template <typename T> struct CameraGradSums {
   const T* parts;  ///< [n, kCameraGradWidth]
   int64_t n;
@@ -152,8 +151,8 @@ template <typename T> struct CameraGradSums {
 };
 inline constexpr int kCameraNumbers = 16 + 16 + 3 + kLensWidth;
 
-/// Of the numbers of view, proj, position and lens, one after the other: where to write it, and the column of
-/// CameraGrad that it is the sum of; -1: it is zero.
+/// Numbers of view, proj, position and lens, one after the other: where to write it, and the column of CameraGrad that
+/// it is the sum of; -1: zero.
 template <typename T> struct CameraNumber {
   T* to;
   int column;

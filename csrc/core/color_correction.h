@@ -1,5 +1,4 @@
 // A training picture as a photograph of another exposure would show it: a colour c becomes A c + b. And the adjoint.
-// cpu/color_correction.cpp and cuda/training/color_correction.cu run both over the pixels.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
-// Constants that the whole pipeline shares: those of 3DGS, sizes of tiles, and limits that keep float32 finite. The
-// viewer's page has copies, which a test compares.
+// Constants of 3DGS, sizes of tiles, and limits that keep float32 finite. The viewer's page has copies, which a test
+// compares.
 #pragma once
 
 namespace ar {
@@ -8,12 +8,12 @@ namespace ar {
 inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
 /// On CUDA where samples move: see moving_grid().
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
-/// An image with fewer such tiles is small: CUDA has other kernels for samples that move.
+/// An image with fewer such tiles is small.
 inline constexpr int kSmallImageTiles = 4096;
 /// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid()).
 inline constexpr int kSpreadImageTiles = 4096;
 
-/// Culled unless the camera-space z of the mean exceeds this [world units].
+/// Least camera-space z of a mean [world units].
 inline constexpr double kNear = 0.2;
 
 /// The Jacobian of a pinhole clamps x/z and y/z to this times tan(fov/2).
@@ -53,11 +53,10 @@ inline constexpr double kMaxDet = 1e30;
 inline constexpr double kMaxScale = 1e18;
 inline constexpr double kMaxOpacity = 1e6, kMaxColor = 1e12;
 
-/// A negative det Sigma counts as zero up to this share of Sigma_xx Sigma_yy: 16 roundings of a cov3d.
+/// A negative det Sigma counts as zero up to this share of Sigma_xx Sigma_yy: 16 roundings.
 inline constexpr double kSingular = 1e-6;
 
-/// An entry of the whitening matrix [1/px]. Only `point` without dilation exceeds it: other ellipses are wider than
-/// 1/56 px.
+/// An entry of the whitening matrix [1/px]. Only `point` without dilation exceeds it.
 inline constexpr double kMaxWhitening = 1e7;
 
 /// Limit of the gradient of a quaternion q, which grows as 1/|q|, and of 1/|q|.

@@ -1,5 +1,4 @@
 // From scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31].
-// project.h calls it; the adjoint is in covariance_vjp.h, but for rotation_vjp.
 #pragma once
 
 #include "core/camera.h"

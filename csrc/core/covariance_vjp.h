@@ -1,6 +1,6 @@
-// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. The
-// caller is project.h. Every product is formed in coordinates in which its terms do not cancel
-// (docs/internals/numerics.md, from "Gradient in the turned frame" on).
+// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. Every
+// product is formed in coordinates in which its terms do not cancel (docs/internals/numerics.md, from "Gradient in the
+// turned frame" on).
 #pragma once
 
 #include "core/blur.h"

@@ -1,5 +1,5 @@
-// Defocus, for blur_of() in camera.h: a point becomes a disc of diameter D, which has the variance D^2 / 16 along every
-// axis (docs/internals/numerics.md, "Lens and shutter"). The camera's model gives D.
+// Defocus: a point becomes a disc of diameter D, which has the variance D^2 / 16 along every axis
+// (docs/internals/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/camera/models.h"

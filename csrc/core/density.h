@@ -1,5 +1,5 @@
 // What density control does to every Gaussian in every step: `observe` adds a picture to its statistics, `add_noise`
-// moves its mean at random. cpu/activations.cpp and cuda/training/activations.cu call both.
+// moves its mean at random.
 #pragma once
 
 #include <cmath>
@@ -32,15 +32,13 @@ template <typename T> struct NoiseParams {
   T strength;              ///< of a transparent Gaussian
 };
 
-/// Adds one picture: the length of the gradient by means2D, and a view where the radius is above 0. A Gaussian that it
-/// does not show has the gradient zero.
+/// Adds one picture: the length of the gradient by means2D, and a view where the radius is above 0.
 template <typename T> AR_HD void observe(const ObserveParams<T>& p, int64_t i) {
   const T x = p.gradients[i * p.stride + p.first], y = p.gradients[i * p.stride + p.first + 1];
   p.gradient_sums[i] += std::sqrt(x * x + y * y);
   p.views[i] += p.radii[i] > 0;
 }
 
-/// Moves a mean along with its covariance, the more the more transparent the Gaussian is.
 template <typename T> AR_HD void add_noise(const NoiseParams<T>& p, int64_t i) {
   const T opacity = opacity_of(p.logit_opacities[i]);
   const T strength = p.strength * opacity_of(T(kNoiseSharpness) * (T(kNoiseOpacity) - opacity));

@@ -1,5 +1,4 @@
 // Statistics of a pixel: how much it shows of every splat, the splat it shows most of, and its median splat.
-// cpu/inspect.h and cuda/inspect.cuh write or add them to the arrays of InspectParams.
 #pragma once
 
 #include "core/blend.h"

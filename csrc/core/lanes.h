@@ -1,6 +1,5 @@
-// The functions that formulas may call on a value type V, for float and double. cpu/pack.h has them for packs of
-// floats. So one formula serves a CUDA thread (V = float), several pixels of the CPU (V = Pack) and a test (V =
-// double). ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
+// The functions that formulas may call on a value type V: here float (a CUDA thread) and double (tests), in cpu/pack.h
+// several pixels of the CPU. ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
 #pragma once
 
 #include <cfloat>
@@ -119,8 +118,8 @@ AR_HD double exp2(double x) { return std::exp2(x); }
 /// Within 4 ulp for normal results.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-// On a device sqrt and quotient lack the compiler's branch for numbers near the ends of the range: no instruction can
-// be moved around a branch.
+// On a device sqrt and quotient lack the compiler's branch for numbers near the ends of the range, which instructions
+// cannot be moved around.
 
 /// Rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {

@@ -1,5 +1,5 @@
 // Structs of a camera. Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur:
-// what lens and shutter add to a covariance in the image; blur_of() in camera.h makes it, blur.h applies it.
+// what lens and shutter add to a covariance in the image.
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -10,7 +10,7 @@ inline constexpr int kDistortion = 12;
 
 template <typename T> struct Lens {
   Vec2<T> tan_half_fov;       ///< orthographic: half the width and height, world units
-  Vec2<T> center;             ///< x/z and y/z at the middle of the picture: a pinhole's clamp, a lens's principal point
+  Vec2<T> center;             ///< x/z and y/z at the middle of the picture
   T aperture, focus;          ///< world units
   Vec3<T> shift, turn;        ///< of the camera during the exposure, along its axes [world units, radians]
   Vec2<T> screen;             ///< of the picture during the exposure [px]
@@ -25,7 +25,7 @@ template <typename T> struct Lens {
            turn.z != T(0) || screen.x != T(0) || screen.y != T(0);
   }
 };
-/// In order. What Python does not set is zero.
+/// What Python does not set is zero.
 struct LensMember {
   const char* name;
   int size;
@@ -44,7 +44,7 @@ inline constexpr int kLensWidth = [] {
 inline constexpr int kLensFixed = 5;  ///< that many at the end have no gradient
 static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
 
-/// A blurred Gaussian with a smaller det Sigma [px^4] has no mass: nothing derived overflows a float.
+/// With a smaller det Sigma [px^4] a blurred Gaussian has no mass: nothing derived overflows a float.
 inline constexpr double kMinBlurredDet = 1e-30;
 
 /// Adds streak streak^T + variance I to a covariance.

@@ -1,5 +1,5 @@
-// Motion blur, for blur_of() in camera.h: a point that moves by u px during the exposure has the variance |u|^2 / 12
-// along u (docs/internals/numerics.md, "Lens and shutter"). The camera's model gives u.
+// Motion blur: a point that moves by u px during the exposure has the variance |u|^2 / 12 along u
+// (docs/internals/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/camera/models.h"

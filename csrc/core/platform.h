@@ -1,4 +1,4 @@
-// Differences of the compilers and devices that the core is built for. Headers of core use these macros.
+// Macros for differences of compilers and devices.
 #pragma once
 
 #if defined(__CUDACC__)

@@ -1,7 +1,6 @@
-// One Gaussian to one splat, and the adjoint: a library for cpu/project.h, cpu/rows.h and cuda/project*.cuh. The camera
-// gives mean, covariance, opacity and depth (project_gaussian), the footprint shape and support (shape_splat), the
-// harmonics colour (splat_color). project_vjp is the adjoint of all three. may_be_visible culls cheaply before them.
-// Public rows and rows of channels are written and read here too.
+// One Gaussian to one splat, and the adjoint. The camera gives mean, covariance, opacity and depth (project_gaussian),
+// the footprint shape and support (shape_splat), the harmonics colour (splat_color). project_vjp is the adjoint of all
+// three. may_be_visible culls cheaply before them. Public rows and rows of channels are here too.
 #pragma once
 
 #include <type_traits>
@@ -35,7 +34,7 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   return g.scale_modifier * max(abs(s.x), max(abs(s.y), abs(s.z)));
 }
 
-/// A cheap test, true for every Gaussian that project() keeps. Writes the projected mean.
+/// A cheap test, true for every Gaussian that is kept. Writes the projected mean.
 template <class Cam, typename T>
 AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds,
                           ProjectedMean<T>& p) {
@@ -75,7 +74,7 @@ template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// Reads row i, whose numbers may be any. False if such a Gaussian would be culled, or the depth is negative or NaN.
+/// Any numbers. False if such a Gaussian would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   const Vec2<T> m = rows.means2d[i];
@@ -111,7 +110,7 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 }
 
 /// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 for a culled
-/// splat (outside the image, or its shape overflows). A splat with a radius may touch no tile.
+/// splat (outside the image, or its shape overflows).
 template <typename T>
 AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
                       Support<T>* support = nullptr) {
@@ -143,7 +142,7 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   return touches || on_image ? radius : 0;
 }
 
-/// `sh`: the coefficients of Gaussian i. False if the colour is not finite.
+/// False if the colour is not finite.
 template <class Cam, typename T>
 AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
   if (g.colors) {
@@ -268,8 +267,8 @@ AR_HD Vec3<T> shown_depth_vjp(const Cam& camera, Vec3<T> view, const ShownGrad<T
   return depth_vjp(camera, view, shown.depth);
 }
 
-/// Writes every gradient of Gaussian i but out.shs, and adds that of a full camera to `camera_grad`, if not null.
-/// grad_of(covariance, opacity) returns the ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp.
+/// All but out.shs; adds that of a full camera to `camera_grad`, if not null. grad_of(covariance, opacity) returns the
+/// ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp.
 template <class Cam, typename T, class GradOf, class Shown, class Out>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, const Shown& shown,
                        const Vec3<T>* sh, Vec3<T>* dL_dsh, const Out& out, CameraGrad<T>* camera_grad = nullptr) {

@@ -1,5 +1,5 @@
 // The rows of the public stages: which Gaussians have one (measure_row), what is written of them (write_row_or_flag),
-// and the adjoint of its depths. A library for cpu/project.h and cuda/project*.cuh.
+// and the adjoint of its depths.
 #pragma once
 
 #include "core/project.h"
@@ -42,8 +42,8 @@ template <typename T> struct RowMeasure {
   T opacity;
 };
 
-/// A row that is not drawn would show nothing: the centre of the nearest pixel is half a pixel further away than the
-/// ellipse, so that alpha is below kAlphaMin there also where the weight is an integral over the pixel.
+/// A row that is not drawn would show nothing: the nearest pixel centre is half a pixel beyond the ellipse, so that
+/// alpha is below kAlphaMin there also where the weight is an integral over the pixel.
 template <typename T>
 AR_HD RowMeasure<T> measure_row(const ProjectedGaussian<T>& p, const RowRules<T>& rules, TileGrid grid) {
   const T v = rules.variance, xx = p.cov.xx + v, yy = p.cov.yy + v;
@@ -98,9 +98,8 @@ template <typename T> AR_HD void write_no_row(const RowOutputs<T>& to, int64_t r
   write_row(to, row, gaussian, nothing, {zero, zero, zero}, zero, 0, RowMeasure<T>{});
 }
 
-/// Writes what `project_rows` writes of Gaussian i but packed rows: its row, or only the flag of whether it has one.
-/// `radius`: as above; 0: it is not drawn, and neither `view`, the mean in camera space, nor `p` is read. Gives `p` the
-/// depth of the row.
+/// Writes the row of Gaussian i, or only the flag of whether it has one. `radius`: as above; 0: it is not drawn, and
+/// neither `view`, the mean in camera space, nor `p` is read. Gives `p` the depth of the row.
 template <class Cam, typename T>
 AR_HD void write_row_or_flag(const Cam& camera, const RowRules<T>& rules, const RowOutputs<T>& to, int32_t* flags,
                              int64_t i, Vec3<T> view, ProjectedGaussian<T>& p, Vec3<T> color, int radius) {

@@ -1,6 +1,5 @@
 // The loss of 3DGS, and its adjoint: structural similarity of two images [SSIM, Eq. 13] and their mean absolute error.
 // The window is a Gaussian of 11 x 11 pixels, standard deviation 1.5 px. Images are in [0, 1], with zeros outside.
-// cpu/ssim.cpp and cuda/training/ssim.cu run over the pixels.
 //
 // [SSIM] Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity, 2004.
 #pragma once

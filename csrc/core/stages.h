@@ -1,12 +1,12 @@
-// Structs that the stages of a frame read and write. csrc/torch fills them by name for the loops of cpu/ and the
-// kernels of cuda/. Pointers are views of host or device memory, never owners. "[n]" is the shape of an array.
+// Structs that the stages of a frame read and write, on both devices. Pointers are views of host or device memory,
+// never owners. "[n]" is the shape of an array. A gradient of a symmetric matrix has its off-diagonal entries doubled
+// (Sym2 in vec.h).
 //
 //     project -> bin -> blend          forward
 //     blend_vjp -> project_vjp         backward
 //
 // Conventions. Camera space is OpenCV's: x right, y down, z forward. 3DGS stores matrices transposed: element (r, c) of
-// the matrix that acts on column vectors is at [4 c + r]. Pixel centres are at integers: px = ((ndc + 1) W - 1) / 2. A
-// gradient by x is dL/dx.
+// the matrix that acts on column vectors is at [4 c + r]. Pixel centres are at integers: px = ((ndc + 1) W - 1) / 2.
 #pragma once
 
 #include <cstddef>
@@ -34,13 +34,13 @@ AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
 /// The tiles on CUDA if samples move. One sample in a large image is so cheap that larger tiles with fewer pairs pay.
-/// In a small image, where splats are smaller than a tile, sixteen samples want shorter lists.
+/// In a small image sixteen samples want shorter lists.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. Four samples are not spread in
-/// large images: more pairs would cost more than shorter lists save.
+/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. In large images the pairs of
+/// spreading four would cost more than shorter lists save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }
@@ -62,7 +62,7 @@ template <typename T> struct CameraView {
   const T* lens = nullptr;
 };
 
-/// The scene, arrays of [n]. Either scales and rotations or cov3ds are null; shs, colors or both are null.
+/// Arrays of [n]. Either scales and rotations or cov3ds are null; shs, colors or both are null.
 template <typename T> struct Gaussians {
   int64_t n;
   const Vec3<T>* means;      ///< world units
@@ -77,10 +77,10 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// Which depth of a Gaussian: that of the camera's model, camera-space z, or the distance from the camera.
+/// Of a Gaussian: that of the camera's model, camera-space z, or the distance from the camera.
 enum class DepthKind : int32_t { kNone, kOfModel, kZ, kDistance };
 
-/// Two more sums per splat, for density control: of positive functions of each pixel's dL/dmean, which do not cancel.
+/// Two more sums per splat, for density control: positive functions of each pixel's dL/dmean.
 enum class MeanSums : int32_t {
   kNone,
   kAbsolute,  ///< |dL/dx| and |dL/dy|, per px
@@ -89,12 +89,12 @@ enum class MeanSums : int32_t {
 
 /// Gradients by the members of Gaussians; null: not wanted.
 template <typename T> struct GaussianGrads {
-  /// Whether gradients are added to these arrays, and to the `dL_dsh` that project_vjp gets.
+  /// Added to these arrays, and to the `dL_dsh` that project_vjp gets.
   static constexpr bool kAdd = false, kAddShs = false;
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
-  Sym3<T>* cov3ds;  ///< off the diagonal doubled, see Sym2
+  Sym3<T>* cov3ds;
   T* opacities;
   Vec3<T>* shs;
   Vec3<T>* colors;
@@ -103,7 +103,7 @@ template <typename T> struct GaussianGrads {
   MeanSums mean_sums;
 };
 
-/// Adds the gradients of another camera; without means2d.
+/// Adds; without means2d.
 template <typename T> struct AddedGrads : GaussianGrads<T> {
   static constexpr bool kAdd = true, kAddShs = true;
 };
@@ -123,7 +123,7 @@ template <class Element> struct Column {
 inline constexpr int kSplatWidth = 12;
 inline constexpr int kSplatColor = 9;
 
-/// A projected Gaussian. An array of splats is a matrix of T.
+/// An array of splats is a matrix of T.
 template <class F, typename T> struct alignas(16) Splat {
   Vec2<T> mean;  ///< px
   typename F::template Shape<T> shape;
@@ -143,7 +143,7 @@ template <typename T> struct alignas(16) SplatRow {
 static_assert(sizeof(SplatRow<float>) == kSplatWidth * sizeof(float));
 static_assert(offsetof(SplatRow<float>, color) == kSplatColor * sizeof(float));
 
-/// The `count` channels of every splat that are blended. Three colours are in the splats themselves.
+/// Null data: the three colours in the splats.
 template <typename T> struct Channels {
   const T* data;
   int64_t stride;      ///< numbers between rows
@@ -153,14 +153,14 @@ template <typename T> struct Channels {
   AR_HD const T* row(int32_t splat) const { return data + (ids ? ids[splat] : splat) * stride; }
 };
 
-/// Where `project` writes a row per Gaussian, unless it is three colours.
+/// Unless it is three colours.
 template <typename T> struct ChannelRows {
   T* data;  ///< or null
   int64_t stride;
   int color, depth, inverse_depth;  ///< first columns; -1: not wanted
 };
 
-/// An image per channel. Null: these channels are not wanted or, of a gradient, zero.
+/// Null: not wanted or, of a gradient, zero.
 template <typename T> struct Planes {
   T* first;  ///< [split, height, width]
   int split;
@@ -172,7 +172,6 @@ template <typename T> struct Planes {
   }
 };
 
-/// Sums per pair, besides the channels.
 template <typename T> struct PairGrad {
   ShapeGrad<T> shape;
   T weighted;  ///< sum of alpha dL/dalpha
@@ -185,13 +184,11 @@ template <typename T> struct ShownGrad {
   Vec3<T> color;
   T depth;
 };
-/// Of a row, with two kinds of depth.
 template <typename T> struct RowShownGrad : ShownGrad<T> {
   T shown_depth;
   DepthKind order, shown;
 };
 
-/// From Gaussians to splats, or to ProjectedRows.
 template <typename T> struct ProjectParams {
   CameraView<T> camera;
   Gaussians<T> gaussians;
@@ -199,24 +196,24 @@ template <typename T> struct ProjectParams {
   T* splats;       ///< SplatRow for every Gaussian that may be seen
   int32_t* radii;  ///< [n] 3DGS's radius [px]; 0: culled
   ChannelRows<T> channels;
-  Channels<T> given;  ///< the caller's channels: a row that is not finite culls its Gaussian; data may be null
+  Channels<T> given;  ///< the caller's, or null: a row that is not finite culls its Gaussian
 };
 
-/// The splats of the public stages, which no footprint has shaped. Row i of every array is splat i.
+/// The splats of the public stages, which no footprint has shaped.
 template <typename T> struct ProjectedRows {
   Vec2<T>* means2d = nullptr;  ///< px
   Sym2<T>* cov2d = nullptr;    ///< px^2
-  T* dets = nullptr;           ///< of cov2d, px^4: from its entries they would cancel; negative: touches no pixel
+  T* dets = nullptr;           ///< of cov2d, px^4; negative: touches no pixel
   T* opacities = nullptr;      ///< with the amplitude of a camera's blur
   T* depths = nullptr;         ///< world units
   Vec3<T>* colors = nullptr;   ///< or null
   T center = T(0);             ///< where pixels have their centres in means2d [px]
 };
 
-/// Where the rows of a camera's Gaussians are among those of all cameras.
+/// Of a camera's Gaussians, among the rows of all cameras.
 struct RowPlaces {
   const int32_t* rows = nullptr;   ///< [n] row of a Gaussian, or -1
-  const int32_t* ends = nullptr;   ///< [n] or else: how many Gaussians up to and including this one have a row
+  const int32_t* ends = nullptr;   ///< [n] or else: rows up to and including this Gaussian's
   const int32_t* radii = nullptr;  ///< [rows, 2] or else: every Gaussian has a row, which counts if this is positive
   int64_t first = 0, last = 0;     ///< with `ends`: rows of the camera, the last not among them
 
@@ -229,7 +226,6 @@ struct RowPlaces {
   }
 };
 
-/// Which Gaussians have a row, and what is in it.
 template <typename T> struct RowRules {
   DepthKind order = DepthKind::kOfModel, shown = DepthKind::kNone;
   bool measured = false;  ///< by RowMeasure (core/rows.h)
@@ -240,18 +236,18 @@ template <typename T> struct RowRules {
   T near = T(0), far = T(0);  ///< of the depth by `order`
 };
 
-/// What is written of every row. Pointers may be null, except those of ProjectedRows.
+/// Pointers may be null, except those of ProjectedRows.
 template <typename T> struct RowOutputs : ProjectedRows<T> {
   T* features = nullptr;  ///< [rows, stride]
   int64_t stride = 0;
-  bool colored = false, shows_depth = false;  ///< three colours are their first columns, a depth their last
+  bool colored = false, shows_depth = false;  ///< first three columns, last column
   int32_t* radii = nullptr;                   ///< [rows] 3DGS's; [rows, 2] of a RowMeasure
   Vec3<T>* conics = nullptr;                  ///< [rows] of a RowMeasure, as are the opacities
   T* shown_opacities = nullptr;               ///< [rows]
   int32_t* gaussian_ids = nullptr;            ///< [rows]
   int32_t* camera_ids = nullptr;              ///< [rows]
   int32_t camera = 0;
-  RowPlaces places;  ///< without `ends` a table, in which Gaussians without a row have zeros, and the determinant -1
+  RowPlaces places;  ///< without `ends` a table: a Gaussian without a row has zeros, and det -1
 };
 
 /// Sent to other ranks.
@@ -268,8 +264,7 @@ static_assert(sizeof(PackedRow<float>) == kPackedWidth * sizeof(float));
 static_assert(sizeof(PackedRow<double>) == kPackedWidth * sizeof(double));
 static_assert(offsetof(PackedRow<float>, depth) == kPackedDepth * sizeof(float));
 
-/// Columns of the gradient by a PackedRow. kPackedCov: xy doubled, see Sym2. kPackedAbsolute, optional: sums over
-/// pixels of |dL/dmean|.
+/// Columns of the gradient by a PackedRow. kPackedAbsolute, optional: sums over pixels of |dL/dmean|.
 inline constexpr int kPackedMean = 0, kPackedCov = 2, kPackedOpacity = 5, kPackedColor = 6, kPackedAbsolute = 9;
 inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
 
@@ -277,7 +272,7 @@ inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
 template <typename T> struct ProjectedRowGrads {
   RowPlaces places;
   Column<const Vec2<T>> means2d;
-  Column<const Sym2<T>> cov2d;  ///< xy doubled, see Sym2
+  Column<const Sym2<T>> cov2d;
   Column<const T> opacities;
   Column<const T> depths;  ///< of the kind `order`
   Column<const Vec3<T>> colors;
@@ -285,41 +280,38 @@ template <typename T> struct ProjectedRowGrads {
   DepthKind order = DepthKind::kOfModel, shown = DepthKind::kNone;
 };
 
-/// Where `project_rows` writes rows of several cameras.
 template <typename T> struct PackedRows {
   PackedRow<T>* rows;    ///< [room] or null
   int64_t room;          ///< rows beyond it are not written
   const int64_t* first;  ///< [1] index of this camera's first row
-  const int32_t* ends;   ///< [gaussians] rows up to and including this Gaussian, also where a colour is not finite
+  const int32_t* ends;   ///< [gaussians] as RowPlaces::ends, also where a colour is not finite
   int32_t *radii, *ids;  ///< [room] radius, 0 if the colour is not finite; index of the Gaussian
   int64_t first_id;      ///< of Gaussian 0
 };
 
-/// From public rows to splats. The numbers may be any; a row that is no splat touches no tile.
+/// The numbers of rows may be any; a row that is no splat touches no tile.
 template <typename T> struct ShapeRowsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< without colours: black
   FootprintChoice footprint;
   TileGrid grid;
-  bool any_color;              ///< a colour that is not finite is drawn, else its row touches no tile
+  bool any_color;              ///< else a row whose colour is not finite touches no tile
   T* splats;                   ///< [n] SplatRow
   const PackedRow<T>* packed;  ///< [n] instead of `rows`, or null
   /// [n, 4] cov2d and determinants, [n] opacities, for the adjoint; or null.
   T *kept_covs, *kept_opacities;
 };
 
-/// From sums of pairs to the gradient by public rows.
 template <typename T> struct RowGradsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
   FootprintChoice footprint;
   Vec2<T>* dL_dmeans2d;
-  Sym2<T>* dL_dcov2d;  ///< xy doubled, see Sym2
+  Sym2<T>* dL_dcov2d;
   T* dL_dopacities;
   Vec2<T>* absolute;    ///< [n] sums over pixels of |dL/dmeans2d|, or null
   Vec3<T>* dL_dcolors;  ///< [n] of the colours in the splats, or null
-  // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients, instead of the
-  // above.
+  // For packed rows: what shape_rows kept, instead of `rows`; [n, packed_width] gradients, instead of the above.
   const T *kept_covs, *kept_opacities;
   T* packed;
   int packed_width;
@@ -332,7 +324,6 @@ template <typename T> struct RowGradsParams {
   AR_HD T opacity(int64_t i) const { return kept_opacities ? kept_opacities[i] : rows.opacities[i]; }
 };
 
-/// From the pairs of every tile, in order of depth, to an image.
 template <typename T> struct BlendParams {
   TileGrid grid;
   const T* splats;
@@ -345,7 +336,7 @@ template <typename T> struct BlendParams {
   int32_t* last;     ///< [samples, height, width] pairs of the tile up to the sample's last splat
 };
 
-/// From the pairs of every tile to statistics of pixels and Gaussians. Null: not wanted.
+/// Null: not wanted.
 template <typename T> struct InspectParams {
   const T* splats;
   TileGrid grid;
@@ -360,7 +351,6 @@ template <typename T> struct InspectParams {
   int32_t* dominated;  ///< [n] pixels with this `dominant`
 };
 
-/// From the gradient by an image to a PairGrad per pair.
 template <typename T> struct BlendVjpParams {
   TileGrid grid;
   const T* splats;
@@ -377,7 +367,7 @@ template <typename T> struct ProjectVjpParams {
   Gaussians<T> gaussians;
   FootprintChoice footprint;
   GaussianGrads<T> grads;
-  /// By the rows of ProjectParams::channels. `data` is null if three colours were blended.
+  /// As ProjectParams::channels. `data` is null if three colours were blended.
   ChannelRows<const T> dL_dchannels;
 };
 

@@ -1,5 +1,4 @@
-// Small vectors and matrices, for all of core. They are aggregates of scalars without padding: an array of them is an
-// array of numbers.
+// Small vectors and matrices: aggregates of scalars without padding, so that an array of them is an array of numbers.
 #pragma once
 
 #include "core/lanes.h"

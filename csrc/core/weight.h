@@ -1,5 +1,4 @@
-// The weight of one splat in one pixel, and its adjoint, for any footprint. cpu/weight.h and cuda/weight.cu run them
-// over the elements of the operator footprint_weight.
+// The weight of one splat in one pixel, and its adjoint, for any footprint.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -1,5 +1,4 @@
-// What training.h does to each Gaussian by itself: activations, the 3D filter, both adjoints, observe and add_noise.
-// Threads share chunks of Gaussians. Sums over chunks are added in order, so that threads change no bit.
+// What training.h does to each Gaussian by itself. Sums over chunks are added in order, so that threads change no bit.
 #include "core/activations.h"
 
 #include <algorithm>

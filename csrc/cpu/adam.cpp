@@ -1,4 +1,4 @@
-// adam of training.h: a step on several tensors at once. Threads share chunks of numbers.
+// adam of training.h: a step on several tensors at once.
 #include "core/adam.h"
 
 #include <algorithm>

@@ -1,5 +1,4 @@
-// Loop of blend. Threads share tiles. In a tile a step is a splat, and a pack is a block of pixels (tile.h). Writes
-// images and, for a backward pass, transmittance and last.
+// Loop of blend. In a tile a step is a splat, and a pack is a block of pixels (tile.h).
 #pragma once
 
 #include <cmath>
@@ -11,7 +10,6 @@
 
 namespace ar::AR_ISA {
 
-/// Packs with an open sample.
 template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance)[kSamples][kTilePixels]) {
   using V = typename LanesOf<T>::Type;
   PackSet<T> open = {};

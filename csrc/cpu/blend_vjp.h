@@ -1,5 +1,5 @@
-// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first. Writes gradients per pair, which
-// project.h, rows.h and sum_channels.h add up. A call is for a window of channels.
+// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first. Writes gradients per pair. A call is for a
+// window of channels.
 #pragma once
 
 #include "core/blend.h"
@@ -9,7 +9,7 @@
 
 namespace ar::AR_ISA {
 
-/// The gradient of a tile, per sample, for channels [first, first + count).
+/// Per sample, for channels [first, first + count).
 template <typename T>
 void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int first, int count, T samples, T* to) {
   constexpr int kCount = LanesOf<T>::kCount;
@@ -98,7 +98,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   for (int64_t k = begin + tile_last; k < end; ++k) write_zeros(k);
   TilePairs<P, T> dL_dplaces = {};
   Replay<P, T> replay({p, view, last, pack_last, begin, tile_last, replay_memory});
-  // Pairs of the same k / kBatch. The replay needs no batch: it knows the pixels.
+  // Pairs of the same k / kBatch. The replay needs no batch.
   TileSplat<P, T> batch[P::kMoves ? 1 : kBatch];
   const auto prefetch_before = [&](int32_t k) {
     if (k >= kPrefetch) prefetch_splat(p.splats, pairs[begin + k - kPrefetch]);

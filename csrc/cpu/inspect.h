@@ -1,5 +1,5 @@
-// Loop of inspect: walks lists as blend does, and writes statistics of pixels (core/inspect.h) and Gaussians. Threads
-// share tiles and add with atomics.
+// Loop of inspect: walks lists as blend does, and writes statistics of pixels and Gaussians (core/inspect.h). Threads
+// add with atomics.
 #pragma once
 
 #include <cmath>

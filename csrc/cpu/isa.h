@@ -1,5 +1,6 @@
-// The instruction set of a translation unit. kernels_*.cpp switch the target, define AR_ISA (a namespace) and AR_LANES
-// (floats per register), and include the loops. The linker cannot merge code of two sets, which have two namespaces.
+// Included by the loops of cpu/ in every kernels_*.cpp, which compiles them for one instruction set. That file defines
+// AR_ISA, the namespace of this set, so that the linker does not merge its code with that of other sets, and AR_LANES,
+// the floats of a register.
 #pragma once
 
 #if !defined(AR_ISA) || !defined(AR_LANES)

@@ -1,5 +1,5 @@
-// Packs of float lanes: the type V of formulas per pixel, a library for blend.h and others. They are vectors of GCC and
-// Clang, with intrinsics for missing operations. Each instruction set has its width and its namespace.
+// Packs of float lanes, the type V of formulas per pixel: vectors of GCC and Clang, with intrinsics for missing
+// operations.
 #pragma once
 
 #include "core/constants.h"
@@ -163,7 +163,7 @@ AR_HD float sum(Pack a) {
 AR_HD float sum(float a) { return a; }
 AR_HD double sum(double a) { return a; }
 
-/// sum() of eight packs, to the bit. Wide packs share instructions.
+/// sum() of eight packs, to the bit.
 AR_HD void sum_lanes(const Pack (&packs)[8], float (&sums)[8]) {
 #if AR_LANES >= 8
   // In the order of sum(). Each step halves the registers.
@@ -186,7 +186,7 @@ AR_HD void sum_lanes(const double (&packs)[8], double (&sums)[8]) {
   for (int i = 0; i < 8; ++i) sums[i] = packs[i];
 }
 
-/// Doubles come one by one: they are for tests and gradcheck.
+/// For tests and gradcheck.
 template <typename T> struct LanesOf;
 template <> struct LanesOf<float> {
   using Type = Pack;
@@ -201,7 +201,7 @@ AR_HD Pack load(const float* p, Pack) { return Pack::load(p); }
 AR_HD double load(const double* p, double) { return *p; }
 AR_HD void store(float* p, Pack v) { v.store(p); }
 AR_HD void store(double* p, double v) { *p = v; }
-/// Numbers that store_lanes() needs. AVX-512 compresses lanes, others store all or none.
+/// AVX-512 compresses lanes, others store all or none.
 AR_HD int lanes_stored(uint32_t lanes, Pack) {
 #if AR_LANES == 16
   return __builtin_popcount(lanes);

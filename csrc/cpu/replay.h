@@ -1,5 +1,5 @@
-// Samples that move. TilePlaces is their state in a tile, for blend.h. Replay composites a tile again for blend_vjp.h
-// and logs alphas and positions, since earlier positions do not follow from later ones.
+// Samples that move. TilePlaces is their state in a tile. Replay composites a tile again for blend_vjp.h and logs
+// alphas and positions, since earlier positions do not follow from later ones.
 #pragma once
 
 #include <algorithm>
@@ -40,7 +40,6 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 
   AR_HD Bounds<V> bounds(int s) const {
-    // With one group the loops are unrolled, and bounds are constants.
     const Bounds<T> cell = kSamples == kGroup ? P::template cell<T>(s) : cells[s];
     return {{V(cell.lo.x), V(cell.lo.y)}, {V(cell.hi.x), V(cell.hi.y)}};
   }
@@ -54,8 +53,7 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
     V log_alpha[kGroup];  ///< To base 2.
   };
 
-  /// Computes the group of sample `first` for whitened pixels z. False if no alpha reaches its minimum: then no
-  /// exponential is needed.
+  /// For whitened pixels z. False if no alpha reaches its minimum: then no exponential is needed.
   template <class Terms> AR_HD bool look(const Terms& terms, Vec2<V> z, int first, int pixel, Group& group) const {
     V most = V(T(kLogAlphaMin - 1));
     AR_UNROLL
@@ -80,9 +78,8 @@ template <class P, typename T> struct ReplayTile {
 
 /// Alphas, and positions before each pair, from the last pair of a tile to the first. Empty unless P moves.
 ///
-/// The tile is composited into a log, so that the walk back needs no exponentials. A full log begins anew. When the
-/// walk reaches earlier pairs, they are composited again from the nearest of kStates states. So memory does not depend
-/// on the list, and a list that fits the log is composited once.
+/// The walk back needs no exponentials. A full log begins anew: when the walk reaches earlier pairs, they are
+/// composited again from the nearest of kStates states. So memory does not depend on the list.
 template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   using V = typename LanesOf<T>::Type;
   using Places = TilePlaces<P, T>;
@@ -91,13 +88,13 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
  public:
   static constexpr int kGroup = Places::kGroup;
 
-  /// A group in a pack of pixels, as the log has it.
+  /// As the log has it.
   struct Found {
     int first;              ///< Sample.
     const uint32_t* lanes;  ///< [kGroup] where the pair was composited.
     const T* numbers;       ///< Of the next sample.
 
-    /// opacity * I and position of the next sample. Zero and `otherwise` where the pair was not composited.
+    /// Of the next sample. Zero and `otherwise` where the pair was not composited.
     AR_HD void read(int j, Vec2<V> otherwise, V& raw, Vec2<V>& place) {
       const int stored = lanes_stored(lanes[j], V());
       raw = load_lanes(numbers, lanes[j], V(T(0)));
@@ -112,7 +109,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     if (tile.count > 0) composite(0, tile.count, true);
   }
 
-  /// For every k, from the last pair to the first, before take().
+  /// For every k, last first, before take().
   void enter(int32_t k) {
     if (k >= first_) return;
     const int32_t kept = k / spacing_;
@@ -163,7 +160,6 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     return reinterpret_cast<std::byte*>(end_ - entries_) - reinterpret_cast<std::byte*>(top_) < kBytesOfPair;
   }
 
-  /// Composites pairs [from, to).
   void composite(int32_t from, int32_t to, bool keep) {
     const cpu::BlendVjpParams<T>& p = tile_.params;
     const TileView& view = tile_.view;

@@ -1,5 +1,5 @@
-// Loops over public rows (ProjectedRows, PackedRow). shape_rows() makes splats of rows. row_grads() adds up the pairs
-// of a splat and writes the gradient of its row.
+// Loops over public rows: shape_rows() makes splats of them, row_grads() adds up the pairs of a splat to the gradient
+// of its row.
 #pragma once
 
 #include "cpu/project.h"

@@ -1,4 +1,4 @@
-// sort.h on several threads. Each thread has a part of the numbers.
+// sort.h on several threads.
 #include "cpu/sort.h"
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// ssim and ssim_vjp of training.h, in blocks of pixels (core/ssim.h). Window sums go along rows, then along columns.
-// Sums of blocks are added in order, so that threads change no bit.
+// ssim and ssim_vjp of training.h, in blocks of pixels. Window sums go along rows, then along columns. Sums of blocks
+// are added in order, so that threads change no bit.
 #include "core/ssim.h"
 
 #include <algorithm>
@@ -11,10 +11,10 @@
 namespace ar::cpu {
 namespace {
 
-/// Pixels of a block: few columns, for the cache, and many rows, since two blocks read those at a border.
+/// Few columns, for the cache, and many rows, since two blocks read those at a border.
 constexpr int kColumns = 128, kRows = 64;
 
-/// Pixels [top, bottom) x [left, right) of a plane.
+/// [top, bottom) x [left, right) of a plane.
 struct Block {
   int64_t plane;
   int top, left, bottom, right;
@@ -44,7 +44,6 @@ template <typename T, int kImages> struct RollingWindow {
   T row[kImages][kColumns + 2 * kSsimRadius];  ///< kSsimRadius pixels more on both sides.
   T sums[kImages][kColumns];
 
-  /// `row` is row y.
   void push(int y) {
     for (int m = 0; m < kImages; ++m) {
       const T* in = row[m] + kSsimRadius;
@@ -53,7 +52,7 @@ template <typename T, int kImages> struct RollingWindow {
       std::copy(out, out + kColumns, along_rows_[slot(y) + kSsimWindow][m]);
     }
   }
-  /// Sums of row y, after the last row under its windows was pushed.
+  /// After the last row under the windows of row y was pushed.
   void sum(int y) {
     for (int m = 0; m < kImages; ++m) {
       const auto* in = along_rows_ + slot(y - kSsimRadius) + kSsimRadius;
@@ -78,7 +77,6 @@ void for_each_row(const Block& block, int height, const Visit& visit, const Fini
   }
 }
 
-/// Zeros outside the image.
 template <typename T, typename Value> void copy_row(const Value* image_row, const Block& block, int width, T* out) {
   const int first = block.left - kSsimRadius;
   const int begin = std::max(first, 0), end = std::min(block.left + kColumns + kSsimRadius, width);

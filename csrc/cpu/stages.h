@@ -49,7 +49,7 @@ template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {
   int threads;
 };
 
-/// 16 bytes, because they are read by depth, at random in memory.
+/// 16 bytes, because they are read at random.
 struct SplatTiles {
   TileMask mask;        ///< 8x8 tiles from (row, column) on. 0: too many for it.
   int32_t row, column;  ///< Row -1: no tile.
@@ -84,7 +84,7 @@ template <typename T> struct BlendParams : ar::BlendParams<T> {
   T* scratch;  ///< [threads, channels.count, kTile * kTile].
 };
 
-/// A call per window of channels. The first makes pair_grads too.
+/// A call per window of channels.
 template <typename T> struct BlendVjpParams : ar::BlendVjpParams<T> {
   TileLists lists;
   int threads;

@@ -1,5 +1,5 @@
-// Tiles on the CPU: a library for blend.h, blend_vjp.h, replay.h and inspect.h. Packs lay out a tile's pixels,
-// reach_of() finds the packs that a splat reaches, and tile_splat() prepares a splat.
+// Tiles on the CPU. Packs lay out a tile's pixels, reach_of() finds the packs that a splat reaches, and tile_splat()
+// prepares a splat.
 #pragma once
 
 #include <algorithm>
@@ -15,8 +15,7 @@ namespace ar::AR_ISA {
 
 inline constexpr int kTilePixels = kTile * kTile;
 
-/// A tile's pixels lie pack by pack, down each column of packs. Packs are nearly square blocks, of which a splat meets
-/// fewer than of rows.
+/// Pack by pack, down each column of packs. A splat meets fewer of nearly square blocks than of rows.
 template <typename T> struct Packs {
   static constexpr int kLanes = LanesOf<T>::kCount, kCount = kTilePixels / kLanes;
   static constexpr int kWidth = kLanes >= 8 ? 4 : kLanes >= 4 ? 2 : 1, kHeight = kLanes / kWidth;
@@ -27,8 +26,7 @@ template <typename T> struct Packs {
   }
 };
 
-/// Column and row of pixels (x, y), and of the first pixel of packs (left, top), for a column of packs or a load of
-/// lanes.
+/// Of pixels (x, y), and of the first pixel of packs (left, top), for a column of packs or a load of lanes.
 template <typename T> struct TilePixels {
   static constexpr int kFirst = Packs<T>::kRows < Packs<T>::kLanes ? Packs<T>::kLanes : Packs<T>::kRows;
   alignas(64) T x[kTilePixels] = {}, y[kTilePixels] = {};
@@ -157,7 +155,7 @@ template <class P, typename T> AR_HD const Splat<P, T>& splat_at(const T* splats
 /// Pairs from prefetch to use.
 inline constexpr int kPrefetch = 16;
 
-/// Pairs that are prepared together, so that branches of the loops over pixels are known early.
+/// Prepared together, so that branches of the loops over pixels are known early.
 inline constexpr int kBatch = 16;
 
 /// For pixels counted from the tile's first.

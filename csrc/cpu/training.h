@@ -1,5 +1,5 @@
-// The loops of a training step besides rendering, in float and double, for csrc/torch/training_cpu.cpp: ssim.cpp,
-// activations.cpp, adam.cpp and color_correction.cpp. Compiled once, for the baseline. Bits do not depend on `threads`.
+// The loops of a training step besides rendering, in float and double, compiled once, for the baseline. Bits do not
+// depend on `threads`.
 #pragma once
 
 #include "core/activations.h"

@@ -1,15 +1,6 @@
-// The backward pass of CUDA, stage by stage in the order of Backend (torch/backend.h), and the kernels that each stage
-// launches. torch/backend_cuda.cpp allocates, fills the parameters of params.h, and calls these functions. forward.cu
-// has the forward pass.
-//
-// | stage             | from, to                                            | kernels                            |
-// |-------------------|-----------------------------------------------------|------------------------------------|
-// | zero_culled_grads | zeros for Gaussians without pairs, beside blend_vjp | project/project_vjp.cuh            |
-// | blend_vjp         | gradients of images to a row for each pair          | still/, moment/ or channels/       |
-// | sum_channels      | rows of pairs to gradients of channels              | project/project_vjp.cuh            |
-// | project_vjp       | rows of pairs, or gradients of public rows, to      | project/project_vjp.cuh            |
-// |                   | gradients of Gaussians and cameras                  |                                    |
-// | row_grads         | rows of pairs to gradients of public rows           | project/project_vjp.cuh            |
+// The backward pass of CUDA, stage by stage in the order of Backend (torch/backend.h): the adjoints of forward.cu,
+// called in the same way. `blend_vjp` is one of still/, moment/ and channels/, the kernels of the others are in
+// project/project_vjp.cuh.
 #include <algorithm>
 #include <mutex>
 #include <set>

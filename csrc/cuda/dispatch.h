@@ -1,5 +1,5 @@
-// The table of blending: family of kernels, tiles and memory by footprint. csrc/torch asks for sizes, forward.cu and
-// backward.cu for the family. A test compares the names in Route with the kernels that are launched.
+// Which family of kernels blends a footprint, in which tiles. forward.cu and backward.cu ask for the family, csrc/torch
+// for sizes of memory. A test compares the names in Route with the kernels that are launched.
 //
 // | footprint                          | channels | tiles                          | family    |
 // |------------------------------------|----------|--------------------------------|-----------|
@@ -14,10 +14,6 @@
 // | moment 1                           | any      | 16x16; 8x8 in small images     | moment/   |
 // | moment 4                           | any      | 8x8                            | moment/   |
 // | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |
-//
-// still/ blends lists in chunks of 256 pairs. moment/ and channels/ walk whole lists, but moment/ cuts long lists, or
-// all lists of small images, into segments (moment/cut_lists.h). The .cu files of all families turn footprint and tile
-// side into constants by visit_lanes and visit_tiles.
 #pragma once
 
 #include <algorithm>
@@ -36,7 +32,6 @@ enum class Family { kStill, kMoment, kChannels };
 template <class F> constexpr int tile_bits_of(bool small_image) {
   return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
 }
-/// Calls visit with the side of tiles as a constant.
 template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
   constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
   if constexpr (kLarge != kSmall) {
@@ -51,7 +46,7 @@ template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) 
     f(OfLane{});
   });
 }
-/// Calls f(PixelsOf<F>{}), which kernels are compiled for, of the footprint at this index of the registry.
+/// Calls f(PixelsOf<F>{}), which kernels are compiled for.
 template <class Function> void visit_pixels(int footprint, Function&& f) {
   visit_footprint(footprint, Footprints{}, [&](auto chosen) { f(PixelsOf<decltype(chosen)>{}); });
 }
@@ -73,7 +68,7 @@ template <Family kFamily, class Function> void visit_lanes(int footprint, TileGr
   });
 }
 
-/// Calls f(F{}, side) for a footprint F whose samples move; `side`: of tiles, a constant.
+/// Calls f(F{}, side) for a footprint F whose samples move.
 template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
   visit_pixels(footprint, [&](auto chosen) {
     using F = decltype(chosen);
@@ -83,7 +78,6 @@ template <class Function> void visit_tiles(int footprint, TileGrid grid, Functio
 
 /// Channels that still/ and moment/ are compiled for, where there are few.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
-/// Calls f with them as a constant.
 template <class T, class Function> void with_few_channels(const Channels<T>& channels, Function&& f) {
   if (!channels.data) return f(std::integral_constant<int, compiled_channels(true)>());
   f(std::integral_constant<int, compiled_channels(false)>());

@@ -1,15 +1,10 @@
-// The forward pass of CUDA, stage by stage in the order of Backend (torch/backend.h), and the kernels that each stage
-// launches. torch/backend_cuda.cpp allocates, fills the parameters of params.h, and calls these functions.
+// The forward pass of CUDA, stage by stage in the order of Backend (torch/backend.h). backend_cuda.cpp allocates, fills
+// the structs of params.h, and calls these functions, which launch the kernels:
 //
-// | stage   | from, to                                             | kernels                                |
-// |---------|------------------------------------------------------|----------------------------------------|
-// | project | Gaussians to splats, or to public rows               | project/project.cuh                    |
-// | bin     | splats to the list of each tile, sorted by depth     | bin/bin.cuh, bin/sort.cuh              |
-// | blend   | lists to images: first a plan of the work, then one  | bin/plan.cuh; still/, moment/ or       |
-// |         | of three families of kernels                         | channels/, by the table of dispatch.h  |
-// | inspect | lists to statistics of pixels and Gaussians          | inspect.cuh                            |
-//
-// backward.cu has the adjoints.
+//   project   Gaussians to splats, or to public rows     project/project.cuh
+//   bin       splats to a list for each tile, by depth   bin/bin.cuh, bin/sort.cuh
+//   blend     lists to images                            bin/plan.cuh, then one of still/, moment/ and channels/
+//   inspect   lists to statistics                        inspect.cuh
 #include <algorithm>
 
 #include "cuda/bin/bin.cuh"

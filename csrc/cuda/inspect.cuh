@@ -1,5 +1,4 @@
-// Kernel inspect; forward.cu launches it. It walks lists as blending does, and writes statistics of pixels and
-// Gaussians (core/inspect.h).
+// Kernel inspect. It walks lists as blending does, and writes statistics of pixels and Gaussians (core/inspect.h).
 #pragma once
 
 #include <algorithm>
@@ -35,8 +34,8 @@ __device__ inline void add_shown(const InspectParams& params, int32_t id, const 
   atomicMax(&params.largest[id], largest);
 }
 
-/// A block per tile of kSide x kSide pixels, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column,
-/// tiles of 4x4 a part of one subtile. F: the footprint.
+/// A block per tile, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column, tiles of 4x4 a part of one
+/// subtile. F: the footprint.
 template <class F, int kSide, Look kLook>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();

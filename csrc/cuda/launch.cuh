@@ -1,9 +1,9 @@
-// A library: how every .cu launches its kernels, how every kernel begins, and what the host asks a device.
+// How the host launches every kernel, how every kernel begins, and what the host asks a device.
 //
 // A kernel may be on the device before earlier kernels of its stream have ended (programmatic dependent launch), which
 // saves 1 to 2 us. So every thread of a kernel first calls wait_for_earlier_kernels(). The exception is a kernel B that
-// runs beside the kernel A before it: A calls let_next_kernel_begin(), and B begin_beside_earlier_kernels(). What B
-// reads was written before a kernel, A or earlier, that waits first and then lets the next kernel begin.
+// runs beside the kernel A before it: A calls let_next_kernel_begin(), and B begin_beside_earlier_kernels(). B reads
+// what was written before a kernel that waits first and then lets the next begin.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -16,7 +16,6 @@
 
 namespace ar::cuda {
 
-/// The answers of more devices are not kept.
 inline constexpr int kMaxDevices = 64;
 
 __device__ inline void wait_for_earlier_kernels() {
@@ -25,23 +24,23 @@ __device__ inline void wait_for_earlier_kernels() {
 #endif
 }
 
-/// The next kernel may begin when all blocks have called this or ended.
+/// When all blocks have called this or ended.
 __device__ inline void let_next_kernel_begin() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
 
-/// Replaces wait_for_earlier_kernels() for kernel B. Returns true for the last block, which does no work: it ends after
-/// kernel A, because the next kernel waits for B alone.
+/// For kernel B. True for the last block, which does no work: it ends after kernel A, because the next kernel waits for
+/// B alone.
 __device__ inline bool begin_beside_earlier_kernels(bool beside) {
   const bool is_last = blockIdx.x == gridDim.x - 1;
   if (!beside || is_last) wait_for_earlier_kernels();
   return is_last;
 }
 
-/// Whether kernels may begin early on the current device. Drivers must allow it in graphs too. Code that is compiled at
-/// load time for older devices does not wait; `kernel` stands for all.
+/// Whether kernels may begin early on the current device. Drivers must allow it in graphs too. Code compiled at load
+/// time from older PTX does not wait; `kernel` stands for all.
 inline bool may_begin_early(const void* kernel) {
   constexpr int kGraphsMayHoldIt = 12030;  // CUDA of the driver
   enum : signed char { kNotAsked, kNo, kYes };
@@ -64,11 +63,11 @@ struct LaunchShape {
   dim3 blocks;
   unsigned threads;
   size_t shared_bytes = 0;  ///< of dynamic_shared()
-  /// If not null, recorded when all blocks have begun, or earlier: no result may depend on it.
+  /// Recorded when all blocks have begun, or earlier: no result may depend on it.
   cudaEvent_t begun = nullptr;
 };
 
-/// Of the current device, which is asked once, by any thread; 0 on errors.
+/// Of the current device, which is asked once; 0 on errors.
 template <cudaDeviceAttr kAttribute> int device_attribute() {
   static std::atomic<int> answers[kMaxDevices];  // 0: not asked
   int device = 0, answer = 0;
@@ -92,7 +91,7 @@ inline size_t shared_bytes_of_blocks(int blocks) {
   return std::min(own, max_shared_bytes());
 }
 
-/// Makes a launch record an event when its blocks have begun; false if the toolkit is older than that.
+/// False if the toolkit is older than that.
 inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[maybe_unused]] cudaEvent_t event) {
 #if CUDART_VERSION >= 12030
   attribute.id = cudaLaunchAttributeLaunchCompletionEvent;

@@ -1,5 +1,4 @@
-// For tests: what launch() (launch.cuh) calls with every kernel that it launches, while csrc/torch/kernels_cuda.cpp
-// records them.
+// For tests: what launch() calls with every kernel, while csrc/torch/kernels_cuda.cpp records them.
 #pragma once
 
 #include <atomic>

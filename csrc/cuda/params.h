@@ -1,6 +1,5 @@
-// Parameter structs of the CUDA stages, and the functions that launch the stages. torch/backend_cuda.cpp fills the
-// structs, the .cu files launch. A struct adds to its namesake in core/stages.h what only CUDA needs. Pointers are
-// device memory of the caller. No function waits for the device.
+// Parameter structs of the CUDA stages, and the functions that launch them. A struct adds to its namesake in
+// core/stages.h what only CUDA needs. Pointers are device memory of the caller. No function waits for the device.
 //
 // Only the device knows the number of pairs. The caller gives room for `capacity` pairs, at least one per splat. If
 // there are more, neighbouring tiles (a patch) share a list, and blending tests its splats against each tile: slower,
@@ -33,24 +32,23 @@ inline constexpr int kDepthHistogramWords = kDepthPasses << kDepthBits;
 /// Of splats without pairs.
 inline constexpr uint32_t kCulledKey = 0xffffffff;
 /// Added to the bits of a depth: then bits 27 to 31 agree for depths from 1/8 to 8192, and the last pass of the sort
-/// has nothing to do.
+/// ends at once.
 inline constexpr uint32_t kDepthKeyOffset = 0x02000000;
 
-/// The slots of a splat: rows of pair_grads, one per pair. Slots of 32 neighbouring splats are adjacent, because a warp
-/// reads them together.
+/// The slots of a splat: rows of pair_grads, one per pair. A warp reads those of 32 neighbouring splats together.
 struct PairRange {
   int32_t first, count;
 };
 
 /// A whole warp writes the pairs of more tiles.
 inline constexpr int kManyTiles = 16;
-/// The tiles of a splat. One struct, because bin reads it in random order.
+/// One struct, because bin reads it in random order.
 struct alignas(16) SplatTiles {
   TileMask mask;  ///< of 8x8 tiles from `first` on; 0: there are tiles beyond
   int32_t first, count;
 };
 
-/// A pair in the list of a tile. In the list of a patch the slot is the splat, to whose row all tiles add.
+/// In the list of a patch the slot is the splat, to whose row all tiles add.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
@@ -58,11 +56,10 @@ struct alignas(8) SlotPair {
 /// Of a SegmentMap (moment/maps.cuh).
 inline constexpr int kMapNumbers = 10;
 
-/// moment/: pairs between checkpoints, and planes of a checkpoint: transmittance and position of every sample.
+/// moment/: pairs between checkpoints; planes of a checkpoint: transmittance and position of every sample.
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
-/// What bin counts.
 struct alignas(8) Counts {
   int64_t pairs;
   int64_t splats;      ///< with pairs
@@ -72,7 +69,6 @@ struct alignas(8) Counts {
   AR_HD bool in_patches(int64_t capacity) const { return pairs > capacity; }
 };
 
-/// What project and shape_rows write for bin.
 struct BinInput {
   uint32_t* keys;              ///< [n] depth keys
   PairRange* ranges;           ///< [n] only the counts
@@ -81,13 +77,11 @@ struct BinInput {
   uint32_t* depth_histograms;  ///< [kDepthPasses, 2^kDepthBits]
 };
 
-/// From Gaussians to splats.
 struct ProjectParams : ar::ProjectParams<float>, BinInput {
   CullBounds<float> bounds;
   TileGrid grid;
 };
 
-/// From Gaussians to public rows.
 struct ProjectRowsParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
@@ -96,13 +90,11 @@ struct ProjectRowsParams {
   RowRules<float> rules;
   RowOutputs<float> rows;
   PackedRows<float> packed;  ///< instead of rows, or null
-  int32_t* flags;            ///< [n] instead of both: 1 for a Gaussian that has a row, else 0
+  int32_t* flags;            ///< [n] instead of both: 1 if the Gaussian has a row, else 0
 };
 
-/// From public rows to splats.
 struct ShapeRowsParams : ar::ShapeRowsParams<float>, BinInput {};
 
-/// From splats in order of depth to pairs.
 struct EmitParams {
   const float* splats;  ///< [n, kSplatWidth]
   int64_t n;
@@ -125,7 +117,6 @@ struct EmitParams {
   SlotPair* slot_pairs;  ///< [capacity] for a backward pass, or null
 };
 
-/// The lists that blending walks.
 struct TileLists {
   const int32_t* pairs;         ///< [capacity, stride] splats (and slots) by tile, depth
   int stride;                   ///< 1, or 2 with slots
@@ -134,7 +125,6 @@ struct TileLists {
   int64_t n, capacity;          ///< splats; room for pairs
 };
 
-/// From lists to images and checkpoints.
 struct BlendParams : ar::BlendParams<float> {
   TileLists lists;
   ChunkPlan plan;
@@ -146,7 +136,6 @@ struct BlendParams : ar::BlendParams<float> {
   uint32_t* reach_words;    ///< [max_reach_words()] moment/, or null
 };
 
-/// From lists to statistics of pixels and Gaussians.
 struct InspectParams : ar::InspectParams<float> {
   TileLists lists;
   // Instead of depths, where splats are Gaussians.
@@ -154,7 +143,7 @@ struct InspectParams : ar::InspectParams<float> {
   const Vec3<float>* means;
 };
 
-/// From gradients of images to sums of pairs. Without channels.data dL_dimage.first is not null.
+/// Without channels.data dL_dimage.first is not null.
 struct BlendVjpParams : ar::BlendVjpParams<float> {
   TileLists lists;
   const TileChunk* chunk_order;  ///< as in ChunkPlan
@@ -171,7 +160,6 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   float* group_sums;    ///< [max_group_sums()] moment/
 };
 
-/// The pairs of every splat.
 struct PairSumsView {
   int64_t n;
   const PairRange* ranges;  ///< [n]
@@ -182,7 +170,7 @@ struct PairSumsView {
   AR_HD bool by_splat() const { return counts->in_patches(capacity); }
 };
 
-/// From sums of pairs to gradients of channels [first, first + count) of every splat.
+/// Of channels [first, first + count) of every splat.
 struct SumChannelsParams {
   PairSumsView sums;
   const float* channel_sums;  ///< as in BlendVjpParams; null: columns of pair_grads
@@ -192,21 +180,18 @@ struct SumChannelsParams {
   int64_t stride;
 };
 
-/// From sums of pairs to gradients of Gaussians.
 struct ProjectVjpParams : ar::ProjectVjpParams<float> {
   PairSumsView sums;
   bool channels_in_pairs;  ///< gradients of dL_dchannels are columns of pair_grads
   float* camera_grads;     ///< [warps_of(n), kCameraGradWidth] of 32 Gaussians, or null
 };
 
-/// Zeros for Gaussians that project_vjp leaves out.
 struct ZeroGradsParams {
   Gaussians<float> gaussians;
   GaussianGrads<float> grads;
   const PairRange* ranges;  ///< [n]
 };
 
-/// From gradients of public rows to gradients of Gaussians.
 struct ProjectRowsVjpParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
@@ -216,7 +201,6 @@ struct ProjectRowsVjpParams {
   float* camera_grads;  ///< as in ProjectVjpParams
 };
 
-/// From sums of pairs to gradients of public rows.
 struct RowGradsParams : ar::RowGradsParams<float> {
   PairSumsView sums;
 };
@@ -229,23 +213,23 @@ void project(const ProjectParams& p, cudaStream_t stream);
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
 
-/// Most splats or pairs that can be sorted.
+/// Of the sorts.
 int64_t max_items();
 
-/// Bytes of scratch memory, multiples of 16. That of the sort by depth begins with histograms.
+/// Bytes, multiples of 16. The scratch of the sort by depth begins with histograms.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 inline int64_t emit_scratch(int64_t n) {
   return ((2 + (n + BinPolicy::kEmitSplats - 1) / BinPolicy::kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
 }
 
-/// Sorts splats by depth, ties in input order. The result is order[0].
+/// Ties stay in input order. The result is order[0].
 struct DepthSort {
   int64_t n;
   uint32_t* keys[2];  ///< [n] both are overwritten
   int32_t* order[2];  ///< [n]
   PairRange* ranges;  ///< [n]
-  bool with_slots;    ///< hand out slots; the order differs from run to run
+  bool with_slots;    ///< hand out slots, in another order in every run
   Counts* counts;     ///< [1]
 };
 /// To set to zero, in pieces of 16 bytes.
@@ -253,7 +237,7 @@ struct ZeroedMemory {
   void* data;
   int64_t bytes;
 };
-/// Comes first: counts pairs and digits of keys, hands out slots, and sets `rest` of `scratch` and `of_tiles` to zero.
+/// Comes first. Sets `rest` of `scratch` and `of_tiles` to zero.
 void count_depths(const DepthSort& p, void* scratch, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream);
 void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
@@ -265,7 +249,7 @@ struct PairFeedback {
   uint32_t frame;
 };
 
-/// Sorts pairs by tile, stably. The result is values[tile_sort_result(grid)].
+/// Stable. The result is values[tile_sort_result(grid)].
 template <class Value> struct TileSort {
   int64_t capacity;
   const Counts* counts;   ///< [1]

@@ -1,5 +1,4 @@
-// A library for torch/backend_cuda.cpp: a stream for kernels that run beside the caller's stream, one per thread
-// and device. It begins after the caller's earlier work. When a SideStream ends, the caller's stream waits for it.
+// A second stream for torch/backend_cuda.cpp, one per thread and device, whose kernels run beside the caller's stream.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -8,8 +7,7 @@
 
 namespace ar::cuda {
 
-/// Work on stream() begins after earlier work of the caller's stream. Work after this object's end waits for it. There
-/// is a stream per thread and device.
+/// Work on stream() begins after earlier work of the caller's stream. Work after this object's end waits for it.
 class SideStream {
  public:
   explicit SideStream(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {

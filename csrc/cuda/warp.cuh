@@ -1,5 +1,5 @@
-// A library for all kernels: sums, votes and searches over a warp, which all lanes must call; sums over a block; and
-// loads, stores and copies of single lanes.
+// Sums, votes and searches over a warp, which all lanes must call; sums over a block; and loads, stores and copies of
+// single lanes.
 #pragma once
 
 #include <cstdint>
@@ -17,7 +17,7 @@ template <typename T> __device__ T warp_sum(T v) {
   return v;
 }
 
-/// Sums over a block of kWarps warps, in a fixed order, for its first thread. All threads call it, once in a kernel.
+/// Sums over a block, in a fixed order, for its first thread. Once in a kernel.
 template <int kWarps, int kCount, typename T> __device__ void sum_block(T (&sums)[kCount]) {
   __shared__ T of_warps[kWarps][kCount];
 #pragma unroll
@@ -155,7 +155,7 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes and returns the first number of a set. Number j is bit 31 - j, which is found faster than bit j.
+/// Removes and returns the first number of a set. Number j is bit 31 - j, which is found faster.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
@@ -205,11 +205,11 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-/// The compiler loads again what it has loaded before this.
+/// What was loaded before is loaded again.
 __device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
 
-/// Sums 8, 9 or 10 values with 9 or 12 shuffles instead of 5 N, as lanes exchange halves of their values. Lane l gets
-/// the sum of value summed_value<N>(l).
+/// With 9 or 12 shuffles instead of 5 N, as lanes exchange halves of their values. Lane l gets the sum of value
+/// summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();

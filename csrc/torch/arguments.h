@@ -1,5 +1,4 @@
-// The arguments of the ops, a struct per op. `each` lists them in the order of the schema. boxing.h makes schemas of it
-// and reads the dispatcher's stack with it. check() (checks.h) brings tensors into the form that kernels read.
+// The arguments of the ops, a struct per op. `each` lists them in the order of the schema, for boxing.h.
 #pragma once
 
 #include <string>
@@ -52,7 +51,7 @@ template <class Tangent> struct CameraNumbers {
   }
 };
 
-/// Tangent: double, or std::vector<double> for several cameras, whose tensors have one more dimension.
+/// Tangent: double, or a vector for several cameras, whose tensors have one more dimension.
 template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor>, CameraNumbers<Tangent> {
   int64_t count() const { return means3D.size(0); }
 
@@ -101,7 +100,7 @@ struct RasterizeArguments : Inputs, FootprintArguments {
   }
 };
 
-/// Cameras of poses, which act on column vectors, and intrinsics. See core/camera/prepare.h.
+/// Poses act on column vectors. See core/camera/prepare.h.
 struct PrepareCamerasArguments {
   Tensor views, intrinsics;     ///< (C, 4, 4), (C, 3, 3).
   OptionalTensor coefficients;  ///< (C, kDistortion), if the model is a lens.
@@ -123,7 +122,6 @@ struct PrepareCamerasArguments {
   }
 };
 
-/// A lens of numbers, some of which may be tensors.
 struct PrepareLensArguments {
   Tensor viewmatrix, projmatrix;
   OptionalTensor tanfovx, tanfovy, aperture, focus, shift, turn, screen, distortion;
@@ -161,12 +159,12 @@ struct BatchArguments : SceneArguments<std::vector<double>>, FootprintArguments 
   }
 };
 
-/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each. Harmonics and values may be of one batch or
-/// camera more: (P, ...), (B, P, ...) or (C, P, ...).
+/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each. Harmonics and values may be (P, ...), (B, P, ...)
+/// or (C, P, ...).
 struct ProjectArguments : BatchArguments {
-  OptionalTensor values;       ///< (P, K), features after the colours.
-  std::vector<int64_t> table;  ///< Sizes (..., C, P) of a table with a row for every Gaussian in every camera, or none.
-  bool measured = false;       ///< Rows and radii as in gsplat.
+  OptionalTensor values;                        ///< (P, K), features after the colours.
+  std::vector<int64_t> table;                   ///< Sizes (..., C, P) of a table with all rows, or none.
+  bool measured = false;                        ///< Rows and radii as in gsplat.
   std::string order = "model", shown = "none";  ///< Kinds of depth: of the rows, and as their last feature.
   double center = 0;
   // Of a RowMeasure:
@@ -254,7 +252,7 @@ struct BlendArguments : ImageArguments {
   }
 };
 
-/// Rows of C cameras to their images: `bin` and `blend` in one, for rows as a table too, (..., 2) and (...,).
+/// `bin` and `blend` in one, for rows as a table too, (..., 2) and (...,).
 struct CompositeArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, features;
   OptionalTensor background;   ///< (..., K), of the first channels, zero behind others.
@@ -310,7 +308,7 @@ struct WeightArguments : FootprintArguments {
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 template <char kLetter> struct WrittenTensor : Tensor {};
 
-/// So that autograd refuses a backward pass that needs the old values. Inference tensors have no version.
+/// Then autograd refuses a backward pass that needs the old values. Inference tensors have no version.
 inline void note_written(const Tensor& t) {
   if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
@@ -384,7 +382,7 @@ struct BlendRowsVjpArguments : ImageArguments {
 /// Of a declaration `name=default`.
 inline std::string_view name_of(std::string_view declaration) { return declaration.substr(0, declaration.find('=')); }
 
-/// Of an op's adjoint. `needs`: which tensors of `of_op` want a gradient.
+/// `needs`: which tensors of `of_op` want a gradient.
 template <class Arguments> struct VjpArguments {
   std::vector<OptionalTensor> dL_doutputs;
   Arguments of_op;

@@ -1,6 +1,5 @@
-// Backend: what a device can do, a function per stage, and the tensors between stages. The ops (rasterize.cpp,
-// stages.cpp, packed.cpp) check arguments, allocate what all devices share, and call it. backend_cpu.cpp and
-// backend_cuda.cpp allocate everything else and run the stages (core/stages.h).
+// Backend: a function per stage, and the tensors between stages. The ops check arguments, allocate what all devices
+// share, and call it. backend_cpu.cpp and backend_cuda.cpp allocate everything else and run the stages (core/stages.h).
 #pragma once
 
 #include <ATen/Context.h>
@@ -19,7 +18,7 @@
 
 namespace ar::ops {
 
-/// From `project` to `bin`. CPU: Gaussians that may be seen. CUDA: all, so that none must be counted.
+/// CPU: Gaussians that may be seen. CUDA: all, so that none must be counted.
 struct SplatTensors {
   Tensor splats;       ///< (n, kSplatWidth).
   Tensor ids, depths;  ///< CPU: (n,), ids ascending.
@@ -29,7 +28,7 @@ struct SplatTensors {
   Tensor memory;  ///< SplatMemory (cuda_views.h).
 };
 
-/// Splats by tile, front to back: from `bin` to `blend`. Members that a device does not use are empty.
+/// Members that a device does not use are empty.
 struct ListTensors {
   Tensor splats;         ///< (n, kSplatWidth).
   Tensor ids;            ///< (n,) int32. CPU: Gaussians. CUDA: splats by depth.
@@ -52,7 +51,6 @@ struct ListTensors {
   }
 };
 
-/// What `blend` saves for its adjoint.
 struct BlendState {
   Tensor transmittance;  ///< (samples, H, W).
   Tensor last;           ///< (samples, H, W) int32.
@@ -82,7 +80,7 @@ struct KeptRows {
   }
 };
 
-/// What `inspect` writes, in the order of the ops' results. Undefined: not wanted.
+/// In the order of the ops' results. Undefined: not wanted.
 struct SummaryTensors {
   Tensor median;                        ///< (1, H, W) depth.
   Tensor dominant;                      ///< (1, H, W) int32.
@@ -101,7 +99,6 @@ struct SummaryTensors {
   }
 };
 
-/// To a list and back. Python has names and widths from _C.
 template <class Members> void append_to(std::vector<Tensor>& list, Members members) {
   members.each([&](const char*, Tensor& t) { list.push_back(t); });
 }
@@ -111,14 +108,13 @@ template <class Members> Members from_list(const std::vector<Tensor>& list, size
   return members;
 }
 
-/// From `blend_vjp` to `project_vjp` or `row_grads`.
 struct PairSums {
   Tensor pairs;         ///< CPU: (N, kPairNumbers), plus 3 for colours. CUDA: (room, kPairGradWidth).
   Tensor means;         ///< (N, 2) MeanSums, if wanted.
   Tensor dL_dchannels;  ///< Like ChannelTensors::rows. Undefined if `pairs` has all channels.
 };
 
-/// Public rows (ProjectedRows in core/stages.h), or their gradient.
+/// ProjectedRows of core/stages.h, or their gradient.
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
   Tensor absolute;  ///< Of a gradient: (n, 2) sums of |dL/dmeans2d|.
@@ -130,7 +126,7 @@ struct RowTensors {
   std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
 };
 
-/// What `project_rows` writes (RowOutputs in core/stages.h): rows of all cameras.
+/// RowOutputs of core/stages.h: rows of all cameras.
 struct ProjectedTensors {
   Tensor means2d, cov2d, dets, opacities, depths;
   Tensor features;                  ///< (n, K), three colours first if `colored`, a depth last if `shows_depth`.
@@ -155,7 +151,7 @@ struct ProjectedGrads {
   int64_t first = 0, last = 0;
 };
 
-/// Where `pack_rows` writes packed rows (PackedRows in core/stages.h).
+/// PackedRows of core/stages.h.
 struct PackedTensors {
   Tensor rows;        ///< (room, kPackedWidth).
   Tensor radii, ids;  ///< (room,) int32.
@@ -181,7 +177,6 @@ FootprintSpec find_footprint(const std::string& key, double option);
 /// On CUDA some footprints have small tiles (cuda/dispatch.h).
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
-/// What all stages of a pass share.
 struct Pass {
   FootprintSpec footprint;
   TileGrid grid;
@@ -196,7 +191,7 @@ struct Pass {
         exact(at::globalContext().deterministicAlgorithms()) {}
 };
 
-/// Memory for the members of BlendState that all devices have.
+/// Memory for what all devices have.
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
   if (!pass.keep) return {};
   const std::vector<int64_t> planes = {pass.footprint.samples, pass.grid.height, pass.grid.width};
@@ -210,7 +205,7 @@ class Backend {
  public:
   virtual ~Backend() = default;
 
-  /// Whether `blend` or `inspect` writes all of this output, by its name in kImageSwitches or SummaryTensors.
+  /// Whether `blend` or `inspect` writes this output, by its name in kImageSwitches or SummaryTensors.
   virtual bool writes(std::string_view output) const = 0;
 
   // Forward.
@@ -228,13 +223,13 @@ class Backend {
   /// Writes `image` and what make_state() made, and makes the other members of `state`.
   virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                      const ImageTensors& image, BlendState& state) = 0;
-  /// Writes median and dominant. The other members are zero before. `depths` are those of splats: the result of
-  /// `project`, on CUDA undefined, and then of the Gaussians `in`; or of rows, without `in`.
+  /// The members but median and dominant are zero before. `depths`: the result of `project` (on CUDA undefined: those
+  /// of the Gaussians `in`); or of rows, without `in`.
   virtual void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs* in,
                        const SummaryTensors& summary) = 0;
 
   // Backward.
-  /// Zeros where project_vjp, which must follow, writes nothing. May run beside blend_vjp.
+  /// Where project_vjp, which must follow, writes nothing. May run beside blend_vjp.
   virtual void zero_culled_grads(const Inputs&, const ListTensors&, const Pass&, const Grads&) {}
   virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                              const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) = 0;
@@ -243,7 +238,7 @@ class Backend {
                              const ChannelTensors& channels, const Grads& grads) = 0;
   /// The same from gradients of public rows. Adds if grads.add.
   virtual Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) = 0;
-  /// From what the two above returned to gradients by the camera, where these are defined: in double, in a fixed order.
+  /// `parts`: what the two above returned. Adds up in double, in a fixed order.
   virtual void sum_camera_grads(const Tensor& parts, const Grads& grads) = 0;
   /// Writes dL_drows.
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
@@ -262,7 +257,7 @@ inline std::string& withheld_output() {
   return name;
 }
 
-/// Raises if the device does not write an output, whose memory would reach the caller as it was allocated.
+/// Raises if the device does not write an output, which would reach the caller as it was allocated.
 inline void check_output(const Backend& backend, std::string_view name, const Tensor& like) {
   TORCH_CHECK_NOT_IMPLEMENTED(backend.writes(name) && name != withheld_output(), name, " cannot be made on ",
                               at::DeviceTypeName(like.device().type(), /*lower_case=*/true), " yet");
@@ -282,7 +277,7 @@ inline ImageTensors make_images(const Backend& backend, const ChannelTensors& ch
   return out;
 }
 
-/// Torch's number, but at most the container's CPU quota: a process that has used up its quota is stopped.
+/// Torch's number, but at most the container's CPU quota.
 int thread_count();
 
 /// The device of `like` is the current one while the backend lives.

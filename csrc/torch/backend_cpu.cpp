@@ -1,5 +1,5 @@
-// Backend for CPU tensors of float32 or float64: allocates, and calls the stages of csrc/cpu. Tensors are checked:
-// contiguous, of one type, and of sizes that fit; ids of inspect are in range. The contents of lists are trusted.
+// Backend for CPU tensors of float32 or float64: allocates, and calls the stages of csrc/cpu. Tensors are checked; the
+// contents of lists are trusted.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/zeros.h>
@@ -20,8 +20,7 @@
 namespace ar::ops {
 namespace {
 
-/// at::empty in huge pages, for fewer faults and misses: splats and pairs are new memory in every pass, visited in
-/// random order.
+/// at::empty in huge pages: splats and pairs are new memory in every pass, visited in random order.
 Tensor make_buffer(at::IntArrayRef sizes, const at::TensorOptions& options) {
   const Tensor buffer = at::empty(sizes, options);
 #if defined(__linux__)

@@ -1,6 +1,6 @@
-// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. Tensors are checked:
-// contiguous, on one device, and of sizes that fit. The host waits for the device in tiles_share_lists() and lap(),
-// with debug, and for the count of pairs where counting_of() or pair_guess.h asks for it.
+// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. The host waits for the device
+// in tiles_share_lists() and lap(), with debug, and for the count of pairs where counting_of() or pair_guess.h asks for
+// it.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
@@ -322,7 +322,7 @@ class CudaBackend final : public Backend {
   double lap() override { return laps_.next(stream_); }
 
  private:
-  /// The caller's stream waits for the side stream. After an exception the destructor does this.
+  /// The caller's stream waits for the side stream.
   void join() { side_.reset(); }
 
   /// Raises the error of a launch or, with `wait`, of the stage.

@@ -1,5 +1,4 @@
 // The structs of arguments.h as torch's dispatcher has arguments: as text in a schema, and as values on a stack.
-// ops.cpp uses both to register ops. take() reads the values of a call.
 #pragma once
 
 #include <ATen/core/ivalue.h>

@@ -1,4 +1,4 @@
-// Of tensors with rows of several cameras, those of one: a library for project.cpp, composite.cpp and stages.cpp.
+// Of tensors with rows of several cameras, those of one.
 #pragma once
 
 #include "torch/backend.h"

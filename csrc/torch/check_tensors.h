@@ -1,5 +1,4 @@
-// Checks of shapes, dtypes and devices: a library for all files with checks, so that messages have one wording. A wrong
-// dtype raises TypeError, anything else ValueError.
+// Checks of shapes, dtypes and devices, so that messages have one wording.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,6 @@
-// checks.h for the rendering ops, and find_footprint(). check_tensors.h words the messages. batches.cpp has
-// arguments of several cameras, training_checks.cpp the other ops.
+// The checks of checks.h for rendering with one camera: shapes, types and values of arguments, lists and saved tensors.
+// batches.cpp has those of several cameras, training_checks.cpp of training. find_footprint() and grid_of() are here
+// too, because they check a footprint's name and a picture's size.
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>
@@ -34,7 +35,7 @@ void check_values(const Tensor& t, const char* name, const Tensor& valid, const 
   TORCH_CHECK_VALUE(false, name, " must ", expected, ", got ", value, " at ", index);
 }
 
-/// Whether these are finite numbers of a camera. at::isfinite takes a third of the time of a small picture for them.
+/// at::isfinite takes a third of the time of a small picture.
 bool are_few_and_finite(const Tensor& t) {
   constexpr int64_t kFew = 64;
   if (!t.is_cpu() || !t.is_contiguous() || t.numel() > kFew) return false;

@@ -1,5 +1,5 @@
 // What the ops accept, on every device. Ops call check() before they touch anything. A wrong dtype raises TypeError,
-// anything else ValueError. Messages say what was expected and what came: `means3D must have shape (P, 3), got (5, 2)`.
+// anything else ValueError: `means3D must have shape (P, 3), got (5, 2)`.
 #pragma once
 
 #include "torch/backend.h"
@@ -33,13 +33,13 @@ void check(AdamArguments& a);
 ProjectArguments batch_of(const BatchArguments& a);
 /// Of camera c. Not yet checked.
 Inputs inputs_of(const ProjectArguments& a, int64_t c);
-/// The part that camera c reads of a tensor whose rows have `dims` dimensions in one batch.
+/// What camera c reads of a tensor whose rows have `dims` dimensions in one batch.
 Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims);
 /// Of all tensors of Gaussians, which have the shapes of those of `a`. T: Tensor or OptionalTensor.
 template <class T> void take_parts(const ProjectArguments& a, int64_t c, SceneTensors<T>& of);
 /// Of `t`, which is `values` or like it.
 inline Tensor values_of(const ProjectArguments& a, int64_t c, const Tensor& t) { return part_of(a, c, t, 2); }
-/// What these rely on. Matrices of a single camera may lack the first dimension. Returns the number of cameras.
+/// Matrices of a single camera may lack the first dimension. Returns the number of cameras.
 int64_t check_cameras(ProjectArguments& a);
 
 /// With respect to differentiable output number `output`: contiguous, or undefined.

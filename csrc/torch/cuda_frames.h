@@ -1,4 +1,5 @@
-// What backend_cuda.cpp keeps between frames and stages. Guesses of how many pairs a frame has, and a clock.
+// What backend_cuda.cpp keeps beyond a call: SharedGuesses, how many pairs frames had (bin/pair_guess.h), and Laps, a
+// clock. And whether a frame's pairs are counted.
 #pragma once
 
 #include <ATen/ops/empty.h>

@@ -1,6 +1,5 @@
-// Tensors as structs of the CUDA kernels: a library for backend_cuda.cpp. SplatMemory, PairMemory and PlanMemory put
-// several arrays into one tensor, since a tensor costs the host microseconds. The checks are of sizes that checks.h
-// cannot know.
+// Tensors as structs of the CUDA kernels. SplatMemory, PairMemory and PlanMemory put several arrays into one tensor,
+// since a tensor costs the host microseconds. The checks are of sizes that checks.h cannot know.
 #pragma once
 
 #include <utility>

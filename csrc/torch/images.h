@@ -1,5 +1,5 @@
-// The images of a rendering, and the channels that they are blended from. Ops choose the channels. make_images()
-// (backend.h) allocates images. Backends call set_images() for the pointers that kernels get.
+// The images of a rendering, and the channels that they are blended from. make_images() (backend.h) allocates images,
+// set_images() sets the pointers that kernels get.
 #pragma once
 
 #include <array>

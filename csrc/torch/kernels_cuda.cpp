@@ -1,5 +1,5 @@
-// For tests: records names of launched kernels. tests/every_kernel.py compares them with those of the library, and with
-// blend_route(), which reads the table of csrc/cuda/dispatch.h.
+// For tests, functions of _C about kernels: launched_kernels(), the names of those launched while recording, and
+// blend_route(), the names that cuda/dispatch.h has for a footprint. It contains no kernels.
 #include <cuda_runtime_api.h>
 
 #include <mutex>

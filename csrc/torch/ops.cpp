@@ -1,5 +1,5 @@
-// Registers the ops of ops.h with torch: schemas, and one kernel for all devices. And the Python module _C, which loads
-// them and has names and sizes for Python to read.
+// Registers the ops of ops.h with torch: a schema made from the arguments, and one kernel for all devices. And the
+// Python module _C, which loads them, has names and widths for Python to read, and a few functions that are no ops.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>
@@ -27,8 +27,8 @@ namespace {
 
 using torch::jit::Stack;
 
-/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Torch's allocator throws an error that
-/// only its message tells from others.
+/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Only the message tells torch's error from
+/// others.
 template <class Work> auto with_memory_errors(const Work& work) {
   try {
     return work();

@@ -1,6 +1,5 @@
-// The ops, each for all devices. The pass is in rasterize.cpp, stages in stages.cpp, rows for several ranks in
-// packed.cpp, and a training step in training.cpp and picture.cpp. They are registered in ops.cpp, made differentiable
-// in autograd.cpp and cast to float32 in autocast.cpp. Comments list results in the order of the schema.
+// The ops, each for all devices, registered in ops.cpp, made differentiable in autograd.cpp and cast to float32 in
+// autocast.cpp. Comments list results in the order of the schema.
 #pragma once
 
 #include <string>
@@ -27,8 +26,8 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> a);
 /// lens (kLensWidth,).
 Results prepare_lens(PrepareLensArguments a);
 Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> a);
-/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped in a picture of `height` px,
-/// which only an equirectangular lens needs. Both are found once for a lens.
+/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped; only an equirectangular lens
+/// needs `height`, px.
 double lens_fold(const std::string& model, const std::vector<double>& distortion);
 double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
                   double y, int height);

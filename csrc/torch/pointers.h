@@ -1,4 +1,4 @@
-// Typed pointers into tensors: a library for views.h and its like. A missing or empty tensor gives null.
+// Typed pointers into tensors. A missing or empty tensor gives null.
 #pragma once
 
 #include <ATen/core/Tensor.h>

@@ -1,5 +1,4 @@
-// scene_grads.h. Backends write the gradients of Gaussians. Those of the camera are summed here, from parts that a
-// backend returns.
+// scene_grads.h. Those of the camera are summed here, from parts that a backend returns.
 #include "torch/scene_grads.h"
 
 #include <ATen/ops/aminmax.h>

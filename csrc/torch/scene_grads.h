@@ -1,6 +1,5 @@
-// Gradients with respect to a scene and its camera: a library for rasterize.cpp, stages.cpp and packed.cpp. It
-// allocates tensors that backends write, and lists them as ops return them. `needs`: those of SceneTensors that are
-// wanted.
+// Gradients with respect to a scene and its camera: allocates tensors that backends write, and lists them as ops return
+// them. `needs`: those of SceneTensors that are wanted.
 #pragma once
 
 #include <functional>

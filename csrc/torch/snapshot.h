@@ -12,7 +12,7 @@
 
 namespace ar::ops {
 
-/// Copies the arguments before the op runs, because after an error a device may give nothing back.
+/// Before the op runs, because after an error a device may give nothing back.
 class Snapshot {
  public:
   template <class Arguments> Snapshot(Arguments& arguments, bool debug, const char* path) : path_(path) {

@@ -1,5 +1,4 @@
-// Tensors as parameters of stages (core/stages.h), as far as all devices share them: a library for backend_cpu.cpp and
-// backend_cuda.cpp. images.h has those of images, cuda_views.h those of CUDA.
+// Tensors as parameters of stages (core/stages.h), as far as all devices share them.
 #pragma once
 
 #include "core/camera.h"
@@ -195,7 +194,7 @@ void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pas
   p.dL_dcolors = pointer<Vec3<T>>(dL_drows.colors);
 }
 
-/// For `blend`, which writes `image` and `state`, and its adjoint, which reads them: there `image` is a gradient.
+/// For `blend` and its adjoint, where `image` is a gradient.
 template <typename T, class Params>
 void set_blend(Params& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                const ImageTensors& image, const BlendState& state) {

@@ -1,12 +1,10 @@
-// The contract of a camera model: the map from the world to pixels, its Jacobian, and the adjoints of both. A model
-// is a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
-// and defocus.h call the functions. Their arguments are those in pinhole.h and clip_space.h.
+// The contract of a camera model: the map from the world to pixels, its Jacobian, and the adjoints of both. A model is
+// a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
+// and defocus.h call it. pinhole.h shows the arguments.
 //
-// The structs that all models share are here too: Camera, FullCamera, ProjectedMean, Jacobian and their gradients.
 //
-// `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` the same point in camera space, p a
-// ProjectedMean.
-// Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
+// `camera` is a Camera or a FullCamera, `mean` a point of the world, `view` the same point in camera space, p a
+// ProjectedMean. Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
 //
 //   kName                               the name of the model in Python
 //
@@ -51,7 +49,6 @@ template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r]
 
 template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
 template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
-/// Adds the gradient by the row.
 template <typename T> AR_HD void add_row_vjp(Vec4<T>& to, T dL_dvalue, Vec3<T> p) {
   to = {to.x + dL_dvalue * p.x, to.y + dL_dvalue * p.y, to.z + dL_dvalue * p.z, to.w + dL_dvalue};
 }

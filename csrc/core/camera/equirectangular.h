@@ -1,9 +1,9 @@
-// The equirectangular picture: columns are longitudes, rows are latitudes; the whole sphere has a focal length of
-// w / (2 pi), h / pi px. core/camera.h, motion.h and defocus.h call it.
+// The equirectangular picture: columns are longitudes, rows are latitudes; the whole sphere has a focal length of w /
+// (2 pi), h / pi px.
 //
-// Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude). Nearer
-// to a pole all derivatives are those at the latitude where it is reached, so that a pole itself has a finite Jacobian
-// and finite gradients (docs/internals/numerics.md, "Equirectangular pictures").
+// Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude): nearer
+// to a pole all derivatives are those at that latitude, and finite (docs/internals/numerics.md, "Equirectangular
+// pictures").
 #pragma once
 
 #include "core/camera/lens_model.h"
@@ -18,8 +18,8 @@ struct Equirectangular : DistanceLens<Equirectangular> {
     return {arc_tangent(p.x, p.z), arc_tangent(p.y, root(p.x * p.x + p.z * p.z))};
   }
 
-  /// The longitude that is less than half a turn from the middle of the picture, which a crop may have on the seam. If
-  /// this copy of a splat shows nothing, none that is a turn away does.
+  /// Less than half a turn from the middle of the picture, which a crop may have on the seam. If this copy of a splat
+  /// shows nothing, none a turn away does.
   template <typename T> AR_HD static bool map(const FullCamera<T>& camera, Vec3<T> mean, ProjectedMean<T>& p) {
     const bool seen = LensModel<Equirectangular>::map(camera, mean, p);
     const T turn = T(2 * kPi) * camera.focal.x, from_middle = p.pixel.x - T(0.5) * (camera.size.x - T(1));
@@ -36,7 +36,7 @@ struct Equirectangular : DistanceLens<Equirectangular> {
     const Vec3<T> edge = at_reach(lens, p);
     return {n * edge.x, n * edge.y, n * edge.z};
   }
-  /// Nearer to a pole than `reach`: of the longitude the derivative at `reach`, which is bounded.
+  /// Nearer to a pole than `reach`: of the longitude the derivative at `reach`.
   template <typename T> AR_HD_CALL static Vec3<T> turned_back_vjp(const Lens<T>& lens, Vec3<T> p, Vec3<T> g) {
     const T n = length(p);
     if (!(sqrt(p.x * p.x + p.z * p.z) * lens.reach < n)) return g;

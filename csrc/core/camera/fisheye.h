@@ -1,6 +1,6 @@
 // Fisheye lenses: equidistant, the angle from the axis being the distance in the image, then distorted. COLMAP's
 // SIMPLE_FISHEYE to THIN_PRISM_FISHEYE and OpenCV's fisheye are special cases of Fisheye. RadTanFisheye is COLMAP's
-// RAD_TAN_THIN_PRISM_FISHEYE. core/camera.h, motion.h and defocus.h call them.
+// RAD_TAN_THIN_PRISM_FISHEYE.
 #pragma once
 
 #include "core/camera/lens_model.h"

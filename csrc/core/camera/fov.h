@@ -1,5 +1,5 @@
 // The FOV lens [Devernay and Faugeras 2001; COLMAP's FOV]: the distance in the image is atan(2 r tan(w / 2)) / w, r
-// that of a pinhole. core/camera.h, motion.h and defocus.h call it.
+// that of a pinhole.
 #pragma once
 
 #include "core/camera/lens_model.h"

@@ -1,8 +1,9 @@
-// What camera models with a lens have in common: the contract of core/camera/contract.h from the model's map alone. The
-// Jacobian is the exact derivative of the map, but for one clamp: beyond `reach` it is that of a ray turned back to
-// `reach`, as 3DGS does with pinholes. Second derivatives come from the same map with other numbers (derivatives.h).
+// Makes all of core/camera/contract.h from the map of a lens. The Jacobian is the exact derivative of the map, but for
+// one clamp: beyond `reach` it is that of a ray turned back to `reach`, as 3DGS does with pinholes. Second derivatives
+// come from the same map with other numbers (derivatives.h).
 //
-// A model inherits LensModel<Model> and defines, for S float, double or a Line, and N an S or a Dual<S>:
+// A model inherits PerspectiveLens, DistanceLens or WideLens, which inherit LensModel, and defines, for S float, double
+// or a Line, and N an S or a Dual<S>:
 //
 //   image_point(Vec3<N> p, const S* k)   where p is seen, in focal lengths from the principal point; k: distortion
 //   turned_back(lens, p)                 p, or if beyond lens.reach a point there
@@ -100,7 +101,7 @@ template <class Model> struct LensModel : CameraModelDefaults {
   }
 
  private:
-  /// Of a 2x3 matrix: pixels by camera space.
+  /// Of a 2x3 matrix: px by camera space.
   template <typename T> struct Rows {
     Vec3<T> x, y;
   };
@@ -111,7 +112,6 @@ template <class Model> struct LensModel : CameraModelDefaults {
     return {dot(xyz(c.view_x), v), dot(xyz(c.view_y), v), dot(xyz(c.view_z), v)};
   }
 
-  /// The coordinates of p as variables.
   template <class S> AR_HD static Vec3<Dual<S>> variables(S x, S y, S z) {
     const S one = S(1), zero = S(0);
     return {{x, {one, zero, zero}}, {y, {zero, one, zero}}, {z, {zero, zero, one}}};
@@ -169,8 +169,8 @@ template <class Model> struct LensModel : CameraModelDefaults {
   }
 };
 
-/// For models that see less than a half space: rays by x/z and y/z, and `reach` and `fold` are the tangents of angles
-/// from the axis. The depth is z.
+/// For less than a half space: rays by x/z and y/z; `reach` and `fold` are the tangents of angles from the axis. The
+/// depth is z.
 template <class Model> struct PerspectiveLens : LensModel<Model> {
   template <typename T> AR_HD static bool inside(const FullCamera<T>& camera, Vec3<T> p) {
     const T r = camera.lens.fold;
@@ -190,7 +190,7 @@ template <class Model> struct PerspectiveLens : LensModel<Model> {
   }
 };
 
-/// For models that see more than a half space: the depth is the distance.
+/// For more than a half space: the depth is the distance.
 template <class Model> struct DistanceLens : LensModel<Model> {
   template <typename T> AR_HD static T length(Vec3<T> p) { return sqrt(dot(p, p)); }
 

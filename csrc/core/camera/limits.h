@@ -1,6 +1,5 @@
 // How far a lens is a map, and how far a picture sees through it: `fold` and `reach` of core/lens.h, by rays in many
-// directions from the axis and at many angles. A library for torch/cameras.cpp and cuda/project/cameras.cu, which share the
-// rays among threads. In double: near a fold derivatives cancel.
+// directions from the axis and at many angles. In double: near a fold derivatives cancel.
 #pragma once
 
 #include <limits>
@@ -52,7 +51,7 @@ AR_HD FullCamera<double> bare_camera(const Lens<double>& lens) {
   return camera;
 }
 
-/// Whether the map keeps the orientation there, and goes outwards: turned about the axis it would keep it, too.
+/// Whether the map keeps the orientation there, and goes outwards.
 template <typename T> AR_HD_CALL bool is_map_at(const FullCamera<T>& camera, double angle, int direction) {
   const double turn = direction * (2 * kPi / kLimitDirections), s = std::sin(angle), c = std::cos(angle);
   const double x = std::cos(turn), y = std::sin(turn);
@@ -73,7 +72,7 @@ AR_HD double limit_angle(double first, double last, int k) {
 }
 
 /// The angle before which the lens is a map in one direction, 0 for none. find(first, last): the number of the first of
-/// the angles from `first` to `last` where it is none, kLimitAngles + 1 if there is none.
+/// these angles where it is none, else kLimitAngles + 1.
 template <class Find> AR_HD double fold_in_direction(LimitKind kind, const Find& find) {
   double first = 0, last = widest_angle(kind);
   for (int pass = 0; pass < 2; ++pass) {  // the second between two neighbours of the first
@@ -86,8 +85,8 @@ template <class Find> AR_HD double fold_in_direction(LimitKind kind, const Find&
   return first;
 }
 
-/// Of a picture of `height` px. `seen`: the number of the last of the angles up to `fold` that is nearer to the axis
-/// than the farthest corner, in any direction, since a strip of a picture may lie between the rays; -1: none.
+/// `seen`: the last of the angles up to `fold` that is nearer to the axis than the farthest corner, in any direction,
+/// since a strip of a picture may lie between the rays; -1: none.
 AR_HD double reach_of(LimitKind kind, const Lens<double>& lens, double fold, int seen, int height) {
   if (kind == LimitKind::kLatitude)  // a pixel is 2 tan_half_fov.y / height radians high: half a pixel from the poles
     return kPi / 2 - min(lens.tan_half_fov.y / height, 1.5);

@@ -1,5 +1,4 @@
-// The list of camera models. A new model is a header and an entry here. camera.h, motion.h and defocus.h visit it, and
-// torch/ops.cpp reads the names.
+// The list of camera models. A new model is a header and an entry here.
 #pragma once
 
 #include <type_traits>

@@ -1,5 +1,5 @@
 // A lens of OpenCV: a pinhole with radial (rational), tangential and thin prism terms. COLMAP's SIMPLE_RADIAL, RADIAL,
-// OPENCV and FULL_OPENCV are special cases. core/camera.h, motion.h and defocus.h call it.
+// OPENCV and FULL_OPENCV are special cases.
 #pragma once
 
 #include "core/camera/lens_model.h"

@@ -1,6 +1,5 @@
-// What kernels read of a camera, from what users give, and the adjoint: the matrices of a pose and intrinsics
-// (prepare_camera), and a Lens of numbers and tensors (LensSource). In double, rounded once. torch/cameras.cpp and
-// cuda/project/cameras.cu call it.
+// From what users give of a camera to what kernels read, and the adjoint: the matrices of a pose and intrinsics
+// (CameraSource), and a Lens of numbers and tensors (LensSource). In double, rounded once.
 #pragma once
 
 #include "core/camera/limits.h"
@@ -97,7 +96,7 @@ template <typename T> struct LensSource {
   AR_HD void write_matrices(int) const {}
 };
 
-/// Cameras of poses and intrinsics, all with the same model, size and planes.
+/// All with the same model, size and planes.
 template <typename T> struct CameraSource {
   int count;
   const T *views, *intrinsics, *coefficients;  ///< [count, 4, 4], [count, 3, 3], [count, kDistortion] or null
@@ -182,7 +181,7 @@ template <typename T> struct CameraSource {
   }
 };
 
-/// Gradients by what CameraSource wrote, null for none, and by what it read.
+/// By what CameraSource wrote, null for none, and by what it read.
 template <typename T> struct CameraSourceGrads {
   const T *viewmatrix, *projmatrix, *position, *lens;
   T *views, *intrinsics, *coefficients;  ///< the last may be null

@@ -1,6 +1,6 @@
 // The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
-// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it. The forms are those of
-// docs/internals/numerics.md, "Logistic window".
+// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. The forms are those of docs/internals/numerics.md,
+// "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -14,7 +14,7 @@ inline constexpr double kLogistic3 = 0.07;
 /// Lower bound of standard deviations [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
-/// One axis of a splat's frame. Coordinates along it are t = u/sigma.
+/// Along an axis of a splat's frame, t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
   T constant, square;  // f(b) - f(a) = constant + square t^2
@@ -126,7 +126,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   }
 
   /// Along one axis -2 ln(F(u)/F(0)) >= u^2 w^2 - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12), wherever F(u)/F(0) > 1/255.
-  /// The tests check it. w^4/48 is for the flat top of a narrow Gaussian's window, 0.05 for the logistic's tail.
+  /// w^4/48 is for the flat top of a narrow Gaussian's window, 0.05 for the logistic's tail.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Vec2<T> w = widened_by_pixel(g.inv_sigma);
     const T slack = (w.x * w.x * w.x * w.x + w.y * w.y * w.y * w.y) / T(48) + T(0.1);

@@ -1,11 +1,11 @@
-// The contract of a footprint: the model that turns a projected Gaussian into its weight I in a pixel. A footprint F is
-// a struct of static functions and constants, and a line in registry.h; nothing else in csrc names it. Projection and
-// the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/internals/adding-a-footprint.md.
+// The contract of a footprint: from a projected Gaussian to its weight I in a pixel. A footprint F is a struct of
+// static functions and constants, and a line in registry.h; all else gets F as a template argument. How to write one:
+// docs/internals/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
 // centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
 //
-// Constants. FootprintDefaults (below) has their defaults.
+// Constants, with defaults in FootprintDefaults:
 //
 //   kName         the name for users: "box"
 //   kKey          a unique key: "box4", since footprints of one name differ in an option. Default: the name
@@ -49,8 +49,8 @@
 //   alpha(terms, p, s) -> V     opacity * I
 //   add_alpha_vjp(terms, p, s, AlphaGrad, ShapeGrad& sums)
 //
-// Samples that move have a displacement `moved` from the node [px], which every composited splat changes. Then p
-// includes `moved`. Such footprints define more; moment.h has the arguments.
+// Samples that move have a displacement `moved` from the node [px], which every composited splat changes, and p
+// includes. Such footprints define more; moment.h has the arguments.
 //
 //   kMoves                      true
 //   kMoveReach                  largest |coordinate| of a displacement [px]; kReach includes it
@@ -59,8 +59,8 @@
 //   alpha_and_move_vjp          the adjoint of both. `free`: alpha is not capped; `moved`: before the splat;
 //                               dL_dmoved: read as after the splat, written as before it
 //
-// Blending calls them in another form. z are whitened coordinates. `place` is the position of a sample, node +
-// displacement, relative to the pixel centre.
+// Blending calls them by whitened coordinates z. `place` is the position of a sample, node + displacement, relative to
+// the pixel centre.
 //
 //   cell                        limits of the position of sample s
 //   whitened, whitened_row      z of the point p, and of (0, y)
@@ -100,7 +100,7 @@ template <class... F> struct FootprintList {};
 
 inline constexpr int kShapeWidth = 5;
 
-/// At run time: `dilation` of point, `variance` of mip [px^2]. Other options are template parameters.
+/// `dilation` of point, `variance` of mip [px^2]. Other options are template parameters.
 struct FootprintOptions {
   double number;
 };
@@ -111,7 +111,6 @@ struct FootprintChoice {
   FootprintOptions options;
 };
 
-/// A number at run time, or a value that selects among footprints of one name.
 struct Option {
   const char* name = nullptr;   ///< null: no option
   const char* value = nullptr;  ///< selects this footprint; null: a number
@@ -124,7 +123,7 @@ template <class V> struct AlphaGrad {
   V dL_dalpha, weighted;
 };
 
-/// Sums over pixels. add_alpha_vjp and prepare_vjp of a footprint share their meaning.
+/// Sums over pixels, whose meaning is the footprint's.
 template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;
@@ -133,7 +132,6 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
   return {a.offset + b.offset, a.shape + b.shape};
 }
 
-/// Limits of a position [px].
 template <class V> struct Bounds {
   Vec2<V> lo, hi;
 
@@ -148,8 +146,7 @@ template <class V> struct Bounds {
   AR_HD MaskOf<V> free_y(V y) const { return (y >= lo.y) & (y <= hi.y); }
 };
 
-/// The cell is [0, 1] x [0, 1]: positions are from its corner, in edges of cells, n per pixel. On a device the clamp is
-/// free.
+/// [0, 1]^2: positions are from its corner, in edges of cells, n per pixel. On a device the clamp is free.
 template <int n> struct UnitCell {
   static constexpr int kUnits = n;
   template <class V> AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
@@ -159,7 +156,6 @@ template <int n> struct UnitCell {
   template <class V> AR_HD MaskOf<V> free_y(V y) const { return in_unit_interval(y); }
 };
 
-/// What a sample that moves adds to the sums of a splat.
 template <class V> struct MoveGrad {
   V weighted;
   ShapeGrad<V> sums;
@@ -187,7 +183,6 @@ struct FootprintDefaults {
 
 template <class F> using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
 
-/// Over which the samples of a pixel may be spread.
 template <class F> constexpr int spread_lanes() {
   if constexpr (std::is_void_v<typename F::Spread>) {
     return 1;

@@ -1,13 +1,13 @@
 // The footprint `cumulant`: the axis-aligned unit pixel through its cumulants, with one exponential, smooth in Sigma
-// and without eigenvectors (docs/internals/numerics.md, "Weights"). registry.h lists it.
+// and without eigenvectors (docs/internals/numerics.md, "Weights").
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/internals/numerics.md, "Weights". t is the
-/// diagonal entry of the conic. Weights beyond the cap are below 2e-6.
+/// One axis of the correction to the exponent, h(p, t) = s(p, t) of that section. t is the diagonal entry of the conic.
+/// Weights beyond the cap are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // by t

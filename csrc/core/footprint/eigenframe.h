@@ -1,5 +1,5 @@
-// A library for analytic.h and erf.h, whose windows are along the axes of a splat. It finds the eigenframe of a
-// covariance, and scales its axes. There is no adjoint: the footprints differentiate it themselves.
+// The eigenframe of a covariance, for analytic.h and erf.h, whose windows are along the axes of a splat and which
+// differentiate it themselves.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -1,5 +1,5 @@
 // The footprint `erf`, a reference: the window of `analytic` with the exact normal distribution instead of the
-// logistic. registry.h lists it.
+// logistic.
 #pragma once
 
 #include "core/footprint/eigenframe.h"

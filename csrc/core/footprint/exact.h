@@ -1,4 +1,4 @@
-// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel. registry.h lists it.
+// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -10,8 +10,8 @@ namespace ar {
 /// with positive weights. docs/internals/numerics.md, "The exact integral", has the rules and error bounds.
 ///
 /// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
-/// `tilt`. The line z.y = 0 is the ridge. A Gaussian that is narrow across the ridge is integrated in strips around the
-/// points where the pixel's edges cross the ridge.
+/// `tilt`. A Gaussian that is narrow across the ridge z.y = 0 is integrated in strips around the points where the
+/// pixel's edges cross it.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
@@ -94,7 +94,7 @@ struct Exact : FootprintDefaults {
   static constexpr double kPanel = 3.3;
   /// 1 + 2 kTail sqrt(2) / kPanel.
   static constexpr int kMaxPanels = 11;
-  /// Keeps crossings finite, and moves none by more than kTail * this.
+  /// Keeps crossings finite.
   static constexpr double kMinTilt = 1e-6;
 
   template <typename T> AR_HD static T square(T x) { return x * x; }
@@ -115,8 +115,7 @@ struct Exact : FootprintDefaults {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px], where rounding matters
-  /// least.
+  /// Of the pixel along an axis, relative to its point nearest to the mean [px], where rounding matters least.
   template <class V> struct Edges {
     V begin, end;
     AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }

@@ -1,6 +1,6 @@
-// A library for the footprints that are Gaussians: point, mip, box and moment, and in part for cumulant, erf and exact.
-// A Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become
-// positive, and does not cancel for long needles as the conic form does (docs/internals/numerics.md, "Whitening").
+// Shared by the footprints that are Gaussians: point, mip, box and moment, and in part by others. A Gaussian is stored
+// as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become positive, and does not
+// cancel for long needles as the conic form does (docs/internals/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -30,7 +30,7 @@ template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
   return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
 }
 
-/// For BoxReach (bin.h), where the bounding box of a box of pixels is smaller in these coordinates.
+/// In these coordinates the boxes of BoxReach (bin.h) are smaller.
 template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
   const Lower2<T>& w = shape.w;
   const bool wide_x = shape.x_given_y == T(0);
@@ -122,7 +122,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  /// z.y takes longer to compute, and is added last.
+  /// z.y takes longer to compute.
   template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
     return madd(-z.y, z.y, madd(-z.x, z.x, V(t.log_peak)));
   }
@@ -142,7 +142,6 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return all_of(T(1 / kBase2) * shape.w); }
 };
 
-/// One of S Gaussians, at p, for its own lane.
 template <int S> struct GaussianSample : GaussianPixels<1> {
   static constexpr int kLanes = S;
   static constexpr double kReach = box_reach<S>();

@@ -1,5 +1,5 @@
-// The footprint `mip`, the 2D filter of Mip-Splatting: the Gaussian convolved with a Gaussian pixel. registry.h lists
-// it; gaussian.h has what blending calls.
+// The footprint `mip`, the 2D filter of Mip-Splatting: the Gaussian convolved with a Gaussian pixel. gaussian.h has
+// what blending calls.
 #pragma once
 
 #include "core/footprint/gaussian.h"

@@ -1,6 +1,5 @@
 // The footprint `moment`: the pixel as S equal square cells, each with its own transmittance. A splat is evaluated at
 // the centroid of the light that earlier splats have left in the cell (docs/internals/numerics.md, "Moving nodes").
-// registry.h lists it, and blend.h calls the functions of samples that move.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -95,7 +94,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <typename T, class V, class Cell>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
     const Vec2<V> along = transform_transposed(t.w, z);
-    // Two forms with the same bits: a GPU thread skips instructions at no cost.
+    // The same bits: a GPU thread skips instructions at no cost.
     if constexpr (std::is_same_v<MaskOf<V>, bool>) {
       const V length = length_of<T, V, Cell>(alpha);
       if (mask) at = cell.held(length, along, at);
@@ -152,7 +151,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
   /// step() alpha / (1 - alpha). In the divisor the factor is free on a device. Without fused multiply-adds it is
-  /// rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings, 6e-6 in float.
+  /// rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha) {
     const V per_step = V(T(1 / step<Cell>()));
     return divide(alpha, madd(-per_step, alpha, per_step));

@@ -1,5 +1,4 @@
-// A library for erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval. The
-// footprints sum these moments over the pixel.
+// For erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval.
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -91,7 +90,7 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
 }
 
 /// Along one axis, how much the pixel may raise the level of the Gaussian with variance 1/t = sigma^2 + 1/12
-/// (docs/internals/numerics.md, "Support"). The tests check that it falls as t^2.
+/// (docs/internals/numerics.md, "Support").
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 }  // namespace ar

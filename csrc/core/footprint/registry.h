@@ -1,5 +1,4 @@
-// The list of footprints. A new footprint is a header and an entry here. Python, cpu/ and cuda/ get every footprint
-// from it.
+// The list of footprints. A new footprint is a header and an entry here.
 #pragma once
 
 #include <cstddef>

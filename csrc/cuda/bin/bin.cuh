@@ -1,8 +1,7 @@
-// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); forward.cu launches them. count_depths counts
-// splats, pairs and digits of depth keys, gives splats slots for gradients, and sets scratch memory to zero. By depth,
-// emit_pairs writes a pair for each tile of a splat. emit_long_pairs does it for splats whose tiles are not among 8x8,
-// and writes all pairs of patches where room is short. By tile, tile_offsets finds the first pair of each tile and
-// reports the number of pairs to the host.
+// Kernels that make the lists of tiles; forward.cu launches them. By splat: count_depths counts splats, pairs and
+// digits of depths, and gives splats slots for gradients. By depth: emit_pairs writes a pair for each tile of a splat,
+// and emit_long_pairs those of splats whose tiles are not among 8x8, or of patches where room is short. By tile:
+// tile_offsets finds the first pair of each tile. The sorts between them are in sort.cuh.
 #pragma once
 
 #include <type_traits>
@@ -30,7 +29,7 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
 }
 
 /// Hands out slots to kRows x 32 splats of a warp, and counts them. `ranges`: of the lane's first splat; the next is
-/// `stride` later. All lanes must call it.
+/// `stride` later.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -107,7 +106,7 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
-/// Digits of the sort by tile: as few, then as short as the number of tiles allows.
+/// Of the sort by tile: as few digits, then as short as the number of tiles allows.
 struct TileDigits {
   static constexpr int kMostBits = BinPolicy::kTileDigitBits, kMostPasses = BinPolicy::kTileDigits;
   int passes = 1, bits = kMostBits - 1;
@@ -159,7 +158,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// The lane of a splat with few tiles, and a bit of its mask.
+/// A lane, and a bit of its splat's mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -171,7 +170,7 @@ struct MaskedPair {
 
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// Pairs of earlier blocks. status: [blocks] as in sort.cuh. All lanes must call it.
+/// Pairs of earlier blocks. status: [blocks] as in sort.cuh.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -230,7 +229,7 @@ __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // While earlier blocks count, tiles are listed in shared memory, for neighbouring lanes to write.
+  // While earlier blocks count: tiles in shared memory, for neighbouring lanes to write.
   const int warp = threadIdx.x / 32;
   int up_to[kRows];  // listed, up to this lane
 #pragma unroll
@@ -318,7 +317,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kThreads - 1) / kThreads * kThreads;
   const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. One for the whole image always fits.
+  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side, or one for the whole image.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
@@ -355,7 +354,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// A warp per long splat, which in emit_pairs would be in a few blocks; or one block for pairs of patches.
+/// A warp per long splat, which emit_pairs would have in a few blocks; or one block for patches.
 __global__ void __launch_bounds__(BinPolicy::kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();

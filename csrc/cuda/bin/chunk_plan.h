@@ -1,6 +1,6 @@
-// The chunk plan: how lists are cut into chunks (front_chunks, ListCut), in which order work begins (ChunkPlan), and
-// how the checkpoints of still/ lie in memory (CheckpointLayout). plan_chunks writes the plan by the kernels
-// of plan.cuh, the kernels of blending read it, and blend_front counts the tiles that it leaves open in it.
+// How lists are cut into chunks (front_chunks, ListCut), in which order work begins (ChunkPlan), and how the
+// checkpoints of still/ lie in memory (CheckpointLayout). The kernels of plan.cuh write the plan, the kernels of
+// blending read it.
 #pragma once
 
 #include <cstdint>
@@ -13,17 +13,14 @@ namespace ar::cuda {
 
 /// Blocks of 256 threads that fill a multiprocessor. Last bits depend on it, by front_chunks().
 inline constexpr int kBlocksPerSm = 8;
-/// Pairs of a chunk of still/: the work of a warp of blend_vjp. Between chunks are checkpoints.
+/// Pairs of a chunk of still/: the work of a warp of blend_vjp.
 inline constexpr int kChunkLength = 256;
-/// Length of a chunk that holds any list.
 inline constexpr int kWholeList = 1 << 30;
-/// More pairs than a list has.
 inline constexpr int kNoList = 1 << 30;
 
-/// Chunks in the front of a tile: blended one after the other, until all pixels have stopped. The chunks of the tail
-/// are blended side by side, which takes more work. The front is short if the tiles cannot fill the device, which works
-/// on `blocks_at_once` blocks. Else it is a block's share of all `pairs` or more, so that fewer than blocks_at_once
-/// tiles have a tail.
+/// Chunks in the front of a tile. The others, the tail, are blended side by side, which takes more work. The front is
+/// short if the tiles cannot fill the device. Else it is a block's share of all `pairs` or more, so that fewer than
+/// blocks_at_once tiles have a tail.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more pairs there are patches
   if (2 * grid.tiles() <= blocks_at_once) return StillPolicy::kShortFront;
@@ -33,24 +30,21 @@ AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   return front / kChunkLength;
 }
 
-/// How plan_chunks cuts the lists of tiles into chunks.
 struct ListCut {
   bool whole;  ///< moment/, channels/: chunks are lists, or segments of long lists
 
-  // Segments have `segment` pairs and are worked on side by side.
   int at_least = 0, shares = 1, segment = 0;  ///< see long_from()
   int max_segments = 0, max_lists = 0;        ///< room; 0: no list is long
-  int longest_from = kNoList;                 ///< pairs of the longest lists: a power of two; 0: all
+  int longest_from = kNoList;                 ///< least pairs of the longest lists, a power of two
 
-  /// Most segments if all lists have `pairs`. It does not depend on room, so that the same lists are always cut alike.
+  /// Most segments if all lists have `pairs`. Not by room, so that the same lists are always cut alike.
   AR_HD int64_t segment_limit(int64_t pairs) const {
     if (at_least == 0) return max_segments;
     const int64_t all = pairs / segment + pairs / at_least;
     const int64_t few = MomentPolicy::kSegments + pairs / segment / MomentPolicy::kPairsPerSegmented;
     return all < few ? all : few;
   }
-  /// Least pairs of a long list, if all lists have `pairs`: at_least, doubled until it is pairs / shares or more. A
-  /// power of two, or 0.
+  /// Least pairs of a long list, if all lists have `pairs`: at_least, doubled until it is pairs / shares or more.
   AR_HD int long_from(int64_t pairs) const {
     int64_t from = at_least;
     while (from > 0 && from < pairs / shares) from *= 2;
@@ -58,7 +52,6 @@ struct ListCut {
   }
 };
 
-/// What plan_chunks and blend count.
 struct PlanCounts {
   int32_t planes;  ///< of checkpoints
   int32_t chunks;  ///< in ChunkPlan::chunk_order
@@ -74,7 +67,6 @@ inline constexpr int kLengthClasses = 33;
 struct WorkSizes {
   int32_t tiles[kLengthClasses], chunks[kLengthClasses];
 };
-/// counts, and scratch of plan_chunks.
 struct PlanState {
   static constexpr int kCounters = 8;  ///< blocks of count_work
   PlanCounts counts;
@@ -87,7 +79,6 @@ struct TileChunk {
   int32_t plane;  ///< still/: first plane of its checkpoints
 };
 
-/// A list that is cut into segments.
 struct CutList {
   int32_t tile;
   int32_t first, segments;  ///< chunk_order[first, first + segments)
@@ -104,7 +95,7 @@ struct CheckpointLayout {
   AR_HD int planes(int samples) const { return keep ? samples * (channels + 1) : samples + channels; }
   /// The first chunk with planes. `front`: front_chunks().
   AR_HD int first_chunk(int front) const { return keep ? 0 : front - 1; }
-  /// Of a tile. Without a tail the last chunk needs no planes.
+  /// Without a tail the last chunk needs no planes.
   AR_HD int tile_planes(int front, int samples, int chunks) const {
     const int used = chunks > front ? chunks - first_chunk(front) : keep ? chunks - 1 : 0;
     return (used > 0 ? used : 0) * planes(samples);

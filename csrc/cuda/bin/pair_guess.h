@@ -1,5 +1,5 @@
-// Room for the pairs of a frame before the device has counted them. Host code: torch/backend_cuda.cpp asks before it
-// bins a frame. The device writes the number of pairs into host memory later, where the next frame reads it.
+// How much room to reserve for the pairs of a frame, guessed from earlier frames. Host code, for
+// torch/backend_cuda.cpp: the device writes the number of pairs into host memory, where a later frame reads it.
 #pragma once
 
 #include <algorithm>
@@ -17,17 +17,16 @@ enum class Counting {
   kAlways,
 };
 
-/// A number as large, or larger by at most an eighth: one of eight in each octave. Buffers of few sizes are used again
-/// by torch's allocator, which else keeps a block for every size.
+/// Rounds up by at most an eighth, to one of eight numbers in each octave. Torch's allocator uses buffers of few sizes
+/// again, and else keeps a block for every size.
 inline int64_t in_steps(int64_t number) {
   int64_t step = 1;
   while (number > 16 * step) step *= 2;
   return (number + step - 1) / step * step;
 }
 
-/// A guess from earlier frames of a class of images. Too little room is slow, not wrong. The first frames are counted;
-/// later frames get the room of the largest frame so far and a reserve, in steps. More Gaussians or tiles than ever
-/// seen enlarge it in proportion. EmitParams needs room for a pair of every Gaussian.
+/// Of a class of images. Too little room is slow, not wrong. The first frames are counted; later frames get the room of
+/// the largest frame so far and a reserve, in steps. More Gaussians or tiles than ever enlarge it in proportion.
 class PairGuess : PairGuessPolicy {
  public:
   /// Room for frame `frame`, at most `most`; 0: count its pairs.
@@ -46,7 +45,6 @@ class PairGuess : PairGuessPolicy {
     if (to_count_ > 0) --to_count_;
   }
 
-  /// What the device has reported of an earlier frame that was not counted.
   void reported(uint32_t frame, int64_t pairs) {
     Frame& of = recent_[frame % kRecent];
     const bool known = of.room > 0 && of.frame == frame;
@@ -67,7 +65,6 @@ class PairGuess : PairGuessPolicy {
     Size size;
     int64_t room;
   };
-  /// Frames that may wait for their report.
   static constexpr int kRecent = 16;
 
   static double growth(int64_t now, int64_t most) {
@@ -84,7 +81,7 @@ class PairGuess : PairGuessPolicy {
   Frame recent_[kRecent] = {};
 };
 
-/// Images that share a guess: numbers of tiles between two powers of two. Photos of many sizes have few classes.
+/// Images that share a guess: their numbers of tiles are between the same powers of two.
 struct ImageClass {
   int device = -1, tile_bits = 0;
   int octave = 0;  ///< bits of the number of tiles
@@ -98,8 +95,8 @@ struct ImageClass {
   }
 };
 
-/// The guesses of the classes used last, each with a word that the device writes. A slot may have another class by
-/// then: the number of the frame tells.
+/// Of the classes used last, each with a word that the device writes. The number of the frame tells if the slot has
+/// another class by then.
 class PairGuesses {
  public:
   static constexpr int kSlots = 64;

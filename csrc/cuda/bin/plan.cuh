@@ -1,5 +1,4 @@
-// The kernels of plan_chunks; forward.cu launches them. count_work counts tiles and chunks by length. plan writes the
-// ChunkPlan (chunk_plan.h).
+// Kernels that write the ChunkPlan (chunk_plan.h): count_work counts tiles and chunks by length, plan orders them.
 #pragma once
 
 #include "cuda/bin/policy.h"
@@ -9,10 +8,10 @@
 
 namespace ar::cuda {
 
-/// The class of a piece of work: longer work has a lower class, and begins first. The order in a class is arbitrary.
+/// Longer work has a lower class, and begins first. The order in a class is arbitrary.
 __device__ inline int work_class(int length) { return __clz(length); }
 
-/// The next index in class `of`, if `wanted`, with an atomic per class of a warp. All lanes must call it.
+/// The next index in class `of`, if `wanted`, with an atomic per class of a warp.
 __device__ inline int take_place(int32_t* next, int of, bool wanted) {
   const uint32_t peers = __match_any_sync(kAllLanes, wanted ? of : -1);
   const int leader = __ffs(int(peers)) - 1;
@@ -121,8 +120,7 @@ __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
 struct ChunkRun {
   int place, begin, end;
 };
-/// Writes the run of each lane; a warp writes long runs together. `first`: what chunk 0 would be. `of_chunk`: planes of
-/// a chunk. All lanes must call it.
+/// A warp writes long runs together. `first`: what chunk 0 would be. `of_chunk`: planes of a chunk.
 __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const TileChunk& first, int of_chunk) {
   constexpr int kMany = 4;
   const bool many = run.end - run.begin > kMany;
@@ -136,8 +134,7 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
   }
 }
 
-/// A thread per tile writes ChunkPlan, whose shapes chunk_plan.h states. Atomics hand out indices, whose order changes
-/// no result. `samples`: of a lane. `layout`: of checkpoints.
+/// A thread per tile. Atomics hand out indices, whose order changes no result. `samples`: of a lane.
 __global__ void __launch_bounds__(PlanPolicy::kThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {

@@ -1,9 +1,8 @@
-// Numbers of bin/ that were chosen by measuring, with what they trade.
+// Numbers chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {
 
-/// Room for pairs (pair_guess.h).
 struct PairGuessPolicy {
   /// Frames that are counted, which waits: at first, and after too many pairs.
   static constexpr int kCountedFrames = 32, kRecountedFrames = 8;
@@ -16,8 +15,7 @@ struct PairGuessPolicy {
 };
 
 struct BinPolicy {
-  /// count_depths: few blocks, because each adds a histogram. Keys that a thread loads at once: registers against
-  /// waiting.
+  /// count_depths: few blocks, because each adds a histogram. Keys loaded at once: registers against waiting.
   static constexpr int kCountThreads = 1024, kCountBlocksPerSm = 1, kCountAtOnce = 4;
 
   /// emit_pairs: splats of a thread, for few blocks, because each waits for the one before.
@@ -35,7 +33,6 @@ struct BinPolicy {
   static constexpr int kOffsetTiles = 16, kOffsetLanes = 8;
 };
 
-/// A pass of a sort by digits of kBits bits.
 template <int kBits> struct SortPolicy {
   static constexpr bool kLong = kBits > 8;
   static constexpr int kThreads = kLong ? 512 : 256;  ///< at least one for each value of a digit

@@ -1,5 +1,5 @@
-// A library for bin.cuh: a pass of a stable radix sort, where only the device knows the number of items. It
-// is "Onesweep" of Adinets and Merrill (2022): a block adds up what earlier blocks have published.
+// A pass of a stable radix sort, for a number of items that only the device knows. It is "Onesweep" of Adinets and
+// Merrill (2022): a block adds up what earlier blocks have published.
 #pragma once
 
 #include "cuda/bin/policy.h"
@@ -112,9 +112,9 @@ template <int kBits, class Value> struct SortShared {
   uint32_t block;
 };
 
-/// Sorts *count items by digit `pass` of kBits bits. Value: int32_t or SlotPair. kFirst: values are indices, and kNoKey
-/// is left out. Arrays: [*count]; with kFirst keys_in: [capacity]. keys_out may be null. may_skip: the last pass ends
-/// at once if all items have one digit; earlier passes exchange values_in and values_out for it.
+/// By digit `pass`. Value: int32_t or SlotPair. kFirst: values are indices, and kNoKey is left out. Arrays: [*count];
+/// with kFirst keys_in: [capacity]. keys_out may be null. may_skip: the last pass ends at once if all items have one
+/// digit; earlier passes exchange values_in and values_out for it.
 template <int kBits, class Value, bool kFirst>
 __global__ void __launch_bounds__(Digits<kBits>::kThreads,
                                   blocks_per_sm(Digits<kBits>::kBlocks, Digits<kBits>::kThreads))

@@ -1,4 +1,9 @@
-// Launches the forward kernel for any number of channels. forward.cu calls blend_channels().
+// The forward pass for any number of channels: finds what a lane blends of the footprint, and launches blend_groups
+// (groups.cuh) for all groups of 32 or 8 channels.
+//
+// Tried and lost (H200, plant hd, `box` 1, 8 channels; docs/internals/log.md, "More than four channels"): backward,
+// batches of 32 splats (1214 instead of 930 us) or 128 (1495 us) for 64; a warp per splat in sum_channels, which took
+// as long for 8 channels as for 32; and lists cut into segments, 65 kernels without a gain ("Features that are gone").
 #include "cuda/channels/groups.cuh"
 
 namespace ar::cuda {

@@ -1,4 +1,5 @@
-// Launches the backward kernel for any number of channels. backward.cu calls blend_vjp_channels().
+// The backward pass of one group of channels: finds what a lane blends of the footprint, and launches blend_groups_vjp
+// (groups_vjp.cuh).
 #include "cuda/channels/groups_vjp.cuh"
 
 namespace ar::cuda {

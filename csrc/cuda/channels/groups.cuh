@@ -1,7 +1,5 @@
-// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8.
-// channels/blend.cu launches it: for footprints whose samples stay, with more than four channels; for kGeneric
-// footprints always. A block per tile and group walks the whole list. It reads lists, splats and channels, and writes
-// images, `transmittance` and `last`.
+// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8. A block per tile
+// and group walks the whole list, and writes images, `transmittance` and `last`.
 #pragma once
 
 #include "cuda/channels/policy.h"
@@ -16,9 +14,9 @@ template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How lanes share the C channels of their pixels. A lane computes the weights of its own pixel, but sums a quarter of
-/// the channels of four pixels, which share a load from shared memory. Pixel i of lane l is the own pixel of lane l ^ 8
-/// i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
+/// A lane computes the weights of its own pixel, but sums a quarter of the C channels of four pixels, which share a
+/// load from shared memory. Pixel i of lane l is the own pixel of lane l ^ 8 i. Lane l has eighths l / 4 and l / 4 ^ 1
+/// of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
@@ -49,7 +47,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Adds up the lanes of a pixel. Each gets the sum.
+  /// Each lane of the pixel gets the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
     if constexpr (kLanes > 1) {  // four lanes with the same channels
@@ -65,7 +63,7 @@ template <int C> struct ChannelShare {
       }
     }
   }
-  /// Adds the channels of lane_id() ^ offset, from its channel `first` on, cyclically.
+  /// From channel `first` of lane_id() ^ offset on, cyclically.
   __device__ void add_from_lane(int offset, int first) {
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
@@ -122,7 +120,7 @@ template <int C> struct ChannelShare {
     }
     return sums[0];
   }
-  /// Of weighted_sum(): the channel of this lane, and whether the lane is the first with it.
+  /// Of weighted_sum(): the channel of this lane; whether it is the first with it.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
@@ -227,7 +225,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
-/// With the colours in the splats as rows of channels.
+/// The colours in the splats as rows of channels.
 template <class Params> Params with_channels(Params p) {
   if (!p.channels.data) p.channels = {p.splats + kSplatColor, kSplatWidth, nullptr, 3};
   return p;

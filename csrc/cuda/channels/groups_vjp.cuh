@@ -1,7 +1,6 @@
-// Kernel blend_groups_vjp: the backward pass for one group of channels. channels/blend_vjp.cu launches it, once per
-// group; later groups add to pair_grads. A block per tile, a warp per subtile, walks the list back to front; lanes
-// share channels as in groups.cuh. It reads lists, splats, channels, `last`, `transmittance` and gradients of images,
-// and writes pair_grads and channel_sums.
+// Kernel blend_groups_vjp: the backward pass for one group of channels; later groups add to pair_grads. A block per
+// tile, a warp per subtile, walks the list back to front; lanes share channels as in groups.cuh. It writes pair_grads
+// and channel_sums.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
 // for them the first group makes all sums of shapes, and reads the channels of all groups.
@@ -11,7 +10,7 @@
 
 namespace ar::cuda {
 
-/// Sums of a pair besides channels: PairGrad and MeanSums.
+/// PairGrad and MeanSums.
 inline constexpr int kShapeSums = 8;
 
 template <class F, int C> struct GroupVjpShared {

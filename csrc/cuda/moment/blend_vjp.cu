@@ -1,6 +1,5 @@
-// Backward launches for footprints whose samples move; backward.cu calls blend_vjp_moment(). Lists that are cut into
-// segments have the kernels segment_maps, chain_maps and segment_vjp. The others have moving_vjp. csrc/torch asks
-// max_group_sums() for the memory that segment_vjp needs.
+// Launches the backward pass of footprints whose samples move: segment_maps, chain_maps and segment_vjp for lists that
+// are cut into segments, moving_vjp for the others.
 #include "cuda/dispatch.h"
 #include "cuda/moment/vjp_segments.cuh"
 

@@ -1,11 +1,11 @@
-// A library for the kernels of moment/; it launches nothing. A pixel of such a footprint F has F::kSamples square
-// cells, each with a sample. A sample is evaluated at its node, which moves in the cell with every splat that is
-// composited. CellLayout says which lane has which samples, MovingSamples is their state, MovingStage a batch of splats
-// in shared memory. MovingBlend composites splats and writes images. Functions that vote, shuffle or wait must be
-// called by all lanes of a warp.
+// What the kernels of moment/ share. A pixel of such a footprint F has F::kSamples square cells, each with a sample,
+// which is evaluated at a node that moves in the cell with every splat composited. CellLayout says which lane has which
+// samples, MovingSamples is their state and its checkpoints, MovingStage a batch of splats in shared memory, and
+// MovingBlend the forward pass of a lane: it composites splats and writes images.
 //
-// Template parameters of all kernels in moment/: F is the footprint, C the number of channels, kSide the side of the
-// tiles [px], Layout a CellLayout, kSegment the pairs of a segment. kKeep: what a backward pass needs is stored.
+// Template parameters in moment/: F is the footprint, C the number of channels, kSide the side of the tiles [px],
+// Layout a CellLayout, kSegment the pairs of a segment. kKeep: what a backward pass needs is stored. Functions that
+// vote, shuffle or wait must be called by all lanes of a warp.
 #pragma once
 
 #include "cuda/moment/cut_lists.h"
@@ -15,15 +15,15 @@
 
 namespace ar::cuda {
 
-/// Of the calling warp, with kClaimed.
+/// With kClaimed.
 __device__ inline int& claimed_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
 }
 
-/// How the samples of a tile are spread over lanes. kCellsOfLane: neighbouring cells of a row. kLanesOfPixel:
-/// neighbouring lanes, a power of two. The pixels of a warp are a rectangle, called a group. kClaimed: warps claim one
-/// group after another. kWarpsOfGroup: warps with different samples of the same pixels.
+/// How the samples of a tile are spread over lanes. A lane has kCellsOfLane neighbouring cells of a row, a pixel
+/// kLanesOfPixel neighbouring lanes (a power of two), and a warp a rectangle of pixels, called a group. kClaimed: warps
+/// claim one group after another. kWarpsOfGroup: warps with different samples of the same pixels.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
           int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kClaimed = false,
           int kWarpsOfGroup = 1>
@@ -54,10 +54,10 @@ struct CellLayout {
     return {float(g % kColumns * kWide + i % kWide), float(g / kColumns * kHigh + i / kWide)};
   }
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
-  /// Whether this lane writes its samples, which others may have too (AheadLayout).
+  /// False where other lanes have the same samples too (AheadLayout).
   __device__ static bool owns() { return true; }
 
-  /// Bit w: the splat reaches the pixels of warp w of this block (kClaimed: of group w), or passes closely.
+  /// Bit w: the splat may reach the pixels of warp w of this block (kClaimed: of group w).
   template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
     constexpr int kOfBlock = kGroups / kBlocks;
     static_assert(kOfBlock % kColumns == 0);
@@ -66,7 +66,6 @@ struct CellLayout {
   }
   __device__ static int own_bit() { return kClaimed ? group() : int(threadIdx.x) / 32; }
 
-  /// Over the lanes of a pixel, in each of them.
   __device__ static float sum_lanes(float x) {
 #pragma unroll
     for (int offset = 1; offset < kLanes; offset *= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
@@ -74,7 +73,7 @@ struct CellLayout {
   }
 };
 
-/// For lists that are not cut: the layout with the least work.
+/// For lists that are not cut.
 template <class F, int kSide>
 using EvenLayout =
     std::conditional_t<(kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>, CellLayout<F::kSide, F::kSide, kSide>>;
@@ -108,14 +107,13 @@ template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, cons
 /// MovingSamples::kTogether for lists that are not cut.
 template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide < kMovingTile;
 
-/// The samples of a lane. A checkpoint has the transmittance and position of each sample of the tile. With kTogether it
-/// is [3, kTilePixels, samples], which suits warps with few pixels, else [samples, 3, kTilePixels].
+/// A checkpoint has the transmittance and position of each sample of the tile. With kTogether it is [3, kTilePixels,
+/// samples], which suits warps with few pixels, else [samples, 3, kTilePixels].
 template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
   Vec2<float> position[kCells];  ///< of the node, in [0, 1]^2
 
-  /// Before all splats.
   __device__ explicit MovingSamples(bool inside) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -138,7 +136,6 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
-  /// With `last`, only what load() would read before pair k.
   __device__ void store(float* checkpoint, int k = 0, const int* last = nullptr) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -149,7 +146,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
       to[2 * kPlane] = position[i].y;
     }
   }
-  /// The state before pair k. A sample with last[i] <= k needs none, and may have no checkpoint.
+  /// Before pair k. A sample with last[i] <= k may have no checkpoint.
   __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -169,8 +166,7 @@ struct Seen {
   float raw;
 };
 
-/// Corners of a lane's cells, in edges of cells from the centre of the tile's first pixel. They round alike in every
-/// layout.
+/// In edges of cells from the centre of the tile's first pixel. They round alike in every layout.
 template <class F, class Layout> struct CellCorners {
   static_assert(F::kSide % Layout::kCells == 0, "the cells of a lane are in one row");
   float left[Layout::kCells], top;
@@ -192,8 +188,8 @@ template <class F, class Layout> struct CellCorners {
 
 template <class Layout> inline constexpr int kListAhead = MomentPolicy::list_ahead(Layout::kCells);
 
-/// A batch of kBatch splats, and for each warp a list of up to kListed of them that reach its pixels. kOffsets: entries
-/// are offsets in memory, not indices.
+/// A batch of splats, and for each warp a list of up to kListed of them that reach its pixels. kOffsets: entries are
+/// offsets in memory, not indices.
 template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffsets = false> struct MovingStage {
   static_assert(kBatch % 32 == 0);
   using Lists =
@@ -224,11 +220,11 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
   }
 };
 
-/// A lane's share of a pixel. kKeep: for a backward pass.
+/// A lane's share of a pixel.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
-  /// Whether the warp first votes if any sample shows the splat. It pays with several cells in a lane and few pixels in
-  /// a warp; kKeep needs the registers.
+  /// Whether the warp first votes if any sample shows the splat. That pays with several cells in a lane and few pixels
+  /// in a warp; kKeep needs the registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   Pixel pixel;
   MovingSamples<F, Layout, kTogether> samples;
@@ -261,7 +257,6 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     });
   }
 
-  /// Writes image and alpha of the pixel and, with kKeep, transmittance and `last`.
   __device__ void write(const BlendParams& params, int first) {
     float through = 0;
 #pragma unroll

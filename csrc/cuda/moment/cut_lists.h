@@ -1,6 +1,5 @@
-// Which lists of footprints whose samples move are cut into segments, which are worked on side by side. The rule is
-// moving_list_cut(). On the host, route_of() (dispatch.h) calls it. On the device, plan_chunks (bin/plan.cuh) writes
-// the segments into the chunk plan, where kernels read them as ListSegment.
+// Which lists of moment/ are cut into segments, to be worked on side by side: moving_list_cut() decides by the size of
+// the image and the room for pairs. ListSegment finds a segment in the chunk plan.
 #pragma once
 
 #include <algorithm>
@@ -26,15 +25,15 @@ struct ListSegment {
   AR_HD int first() const { return number - index; }
 };
 
-/// Pairs of a segment where `samples` samples move, in tiles of side x side pixels.
+/// Pairs of a segment.
 AR_HD constexpr int moving_segment(int samples, int side) {
   return MomentPolicy::segment_length(samples, side < kMovingTile);
 }
 
-/// In small images the longest list sets the time. Tiles of 4x4 pixels are many, with short lists.
+/// In small images the longest list sets the time. Tiles of 4x4 pixels have short lists.
 inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
 
-/// `capacity`: pairs that there is room for. In large images lists are cut whose blocks would outlast all others.
+/// `capacity`: room for pairs. In large images lists are cut whose blocks would outlast all others.
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid, int multiprocessors) {
   const int length = moving_segment(samples, grid.side()), tiles = int(grid.tiles());
   const int64_t segments = capacity / length;

@@ -1,11 +1,8 @@
-// Kernels filter and listed_blend: the forward pass of moment/ for lists that are cut into segments. blend_moment
-// (blend.cu) launches them. `filter` tests every pair of these lists against every pixel of its tile, and writes the
-// bits to reach_words. `listed_blend` reads the bits, lists and splats, and writes what moving_blend writes for other
-// lists, but for checkpoints within the segments after the first, which segment_maps stores.
-//
-// In a small image of a large scene, a tile may have hundreds of thousands of splats, most of them smaller than a
-// pixel. So a pixel composites only splats that reach it. It has a queue of them (queue.cuh), or its warp walks the
-// splats that reach any of a few pixels.
+// Kernels filter and listed_blend: the forward pass for lists that are cut into segments. In a small image of a large
+// scene, a tile may have hundreds of thousands of splats, most of them smaller than a pixel. So `filter` tests every
+// pair against every pixel of its tile, and writes bits to reach_words. `listed_blend` composites in a pixel only
+// splats that reach it, from a queue (queue.cuh), or walks those that reach any of a warp's few pixels. It writes what
+// moving_blend writes for other lists, but for checkpoints within later segments, which segment_maps stores.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -24,7 +21,7 @@ template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float
   return ((1u << end) - 1) & ~((1u << first) - 1);
 }
 
-/// Bit b of lane l becomes bit l of lane b. In step s, lanes whose numbers differ by s exchange bits whose numbers do.
+/// Bit b of lane l becomes bit l of lane b.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
 #pragma unroll
   for (int s = 16; s > 0; s /= 2) {
@@ -36,8 +33,7 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
   return bits;
 }
 
-/// A block tests kFilterPiece pairs of a segment at a time, a thread each, and writes reach_words as
-/// pixel_words() says.
+/// A thread tests a pair. reach_words: as pixel_words() says.
 template <class F, int kSide>
 __global__ void __launch_bounds__(MomentPolicy::kFilterPiece) filter_kernel(const BlendParams params) {
   wait_for_earlier_kernels();  // first: moving_blend_kernel reads the plan
@@ -83,7 +79,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   uint16_t numbers[kListedBatch];  ///< in the batch
   uint32_t words[kMostPixels][32];
 
-  /// Collects the pairs of the batch from pair k on that reach any pixel, and returns their number.
+  /// Pairs of the batch from pair k on that reach any pixel.
   template <class Layout> __device__ int collect(const float* splats_in, const TileList& list, int k) {
     const int lane = lane_id();
     uint32_t word = 0;
@@ -103,7 +99,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
     return all;
   }
 
-  /// Which of the `count` pairs, from `from` on, reach this lane's pixel, in the order of take_first.
+  /// Which of the `count` pairs, from `from` on, reach this lane's pixel, for take_first.
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
     const int lane = 31 - lane_id(), number = from + lane < count ? numbers[from + lane] : 0;
     uint32_t mine = 0;
@@ -117,7 +113,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
-/// A warp walks the splats that reach any of its pixels. Parameters as of blend_queued.
+/// A warp walks the splats that reach any of its pixels.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {
@@ -183,8 +179,7 @@ template <class F> inline constexpr int kListedWarps = MomentPolicy::listed_warp
 template <class F, int kSide> struct ListedLayouts {
   static constexpr int kWarps = kListedWarps<F>;
   using Longest = AheadLayout<F, kSide, 1, kWarps>;
-  /// For lists that are not among the longest: queues with one sample, walks with four. With more samples there are no
-  /// such lists.
+  /// For all but the longest lists: queues with one sample, walks with four. With more there are no such lists.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = CellLayout<1, 16, kSide, kWarps>;  ///< from kLongList pairs on
@@ -193,8 +188,7 @@ template <class F, int kSide> struct ListedLayouts {
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
-  /// A multiple of kOfLongest: a block has the same pixels in each of its tiles. In small images moving_blend has
-  /// little to do.
+  /// A multiple of kOfLongest: a block has the same pixels in each of its tiles.
   static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
     const int64_t longest = std::min(cut.max_lists, MomentPolicy::kLongestAtOnce), lists = cut.max_lists;
     const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers
@@ -211,7 +205,7 @@ template <class F, int C, int kSide> union WarpStage {
 };
 
 /// A block has a pixel of one of the longest lists, which come first, or each of its warps a few pixels of another
-/// list. Writes the channels [first, first + C) (template parameters: cells.cuh).
+/// list. Writes the channels [first, first + C).
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // moving_blend_kernel need not wait for filter_kernel

@@ -1,10 +1,7 @@
-// Kernels segment_maps and chain_maps: the first steps of the backward pass of moment/ for lists that are cut.
-// blend_vjp_moment (blend_vjp.cu) launches them before segment_vjp.
-//
-// The Adjoint of a sample goes through a segment as an affine map, so segments can be differentiated side by side.
-// `segment_maps` reads checkpoints, `last`, splats and the gradient of the image. It writes the map of each segment
-// but the first to adjoint_maps, and the checkpoints that blend did not store. `chain_maps` applies the maps from the
-// last segment to the first, and replaces them by what segment_vjp begins with.
+// Kernels segment_maps and chain_maps: the first steps of the backward pass for lists that are cut. The Adjoint of a
+// sample goes through a segment as an affine map. `segment_maps` writes the map of each segment but the first to
+// adjoint_maps, and the checkpoints that blend did not store. `chain_maps` applies the maps from the last segment to
+// the first, and replaces them by what segment_vjp begins with.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +12,7 @@
 
 namespace ar::cuda {
 
-/// The image of zero, and what a change of each number adds. The position does not change `later`.
+/// What zero becomes, and what a change of each number adds. The position does not change `later`.
 struct SegmentMap {
   static constexpr int kNumbers = kMapNumbers;
   Adjoint of_zero, by_later;
@@ -59,9 +56,8 @@ using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTil
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 
-/// A block has a segment of kSegment pairs and 1 / kBlocks of its tile. Writes the maps of the samples, and the
-/// checkpoints within the segment. The first segment of a list needs no maps, and blend has stored its checkpoints.
-/// Reads the channels [first, first + C) (template parameters: cells.cuh).
+/// A block has a segment and 1 / kBlocks of its tile. The first segment of a list needs no maps, and blend has stored
+/// its checkpoints. Reads the channels [first, first + C).
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
 __global__ void __launch_bounds__(Layout::kThreads,
                                   blocks_per_sm(MomentPolicy::kMapThreads / Layout::kThreads, Layout::kThreads))
@@ -121,7 +117,7 @@ __global__ void __launch_bounds__(Layout::kThreads,
   Memory(params.adjoint_maps, Layout::first_sample(), Layout::pixel_number()).put(segment.number, m);
 }
 
-/// A thread has a sample; block b has samples of list b / F::kSamples (template parameters: cells.cuh).
+/// A thread has a sample; block b has samples of list b / F::kSamples.
 template <class F, int kSide, int kSegment>
 __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();

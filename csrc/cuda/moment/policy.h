@@ -1,4 +1,4 @@
-// Numbers of moment/ that were chosen by measuring, with what they trade.
+// Numbers chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {
@@ -7,15 +7,15 @@ namespace ar::cuda {
 struct MomentPolicy {
   /// Channels that are blended at once where there are more than kFewChannels.
   static constexpr int kChannels = 8;
-  /// Splats between two votes on whether any sample is open.
+  /// As in StillPolicy.
   static constexpr int kBetweenVotes = 16;
   /// Entries of a warp's list of splats that are read at once.
   static constexpr int list_ahead(int cells_of_lane) { return cells_of_lane <= 2 ? 4 : 1; }
   /// Resident threads of moving_blend.
   static constexpr int blend_threads(int channels) { return channels == 3 ? 1024 : 0; }
 
-  /// In large images lists of so many pairs are cut into segments, or of the share of a block (kListBlocksPerSm) if
-  /// that is more. A cut list takes more work, which blocks share.
+  /// In large images lists of so many pairs are cut, or of the share of a block (kListBlocksPerSm) if that is more. A
+  /// cut list takes more work, which blocks share.
   static constexpr int kLongList = 4096;
   static constexpr int kListBlocksPerSm = 4;
   /// Pairs of a segment. Longer segments need fewer maps, shorter ones fill a device with smaller scenes.
@@ -29,8 +29,7 @@ struct MomentPolicy {
 
   /// Pairs that a block of filter tests at once.
   static constexpr int kFilterPiece = 256;
-  /// Blocks of filter and warps of listed_blend in large images: most of the device is left to moving_blend, which
-  /// begins beside them.
+  /// In large images most of the device is left to moving_blend, which begins beside filter and listed_blend.
   static constexpr int kFilterBlocksPerSm = 2, kListedWarpsPerSm = 8;
   /// Longest lists in small images of which each warp of listed_blend has one task.
   static constexpr int kLongestAtOnce = 128;
@@ -51,8 +50,7 @@ struct MomentPolicy {
   static constexpr int kMostInShared = 8;
   /// Groups of a segment per warp: fewer, but longer blocks.
   static constexpr int groups_of_warp(int samples, bool small_tiles) { return samples == 1 || small_tiles ? 1 : 2; }
-  /// Groups of a tile whose sums are added in shared memory; of more groups in BlendVjpParams::group_sums. And pairs
-  /// between two barriers.
+  /// Most groups of a tile whose sums are added in shared memory, else in group_sums; pairs between two barriers.
   static constexpr int kMostSumsInside = 2;
   static constexpr int segment_batch(bool sums_inside) { return sums_inside ? 64 : 128; }
 };

@@ -1,14 +1,13 @@
-// A library for listed_blend_kernel (listed.cuh): pixels with queues. A pixel has a queue of the splats that reach it,
-// filled from the bits of filter_kernel. It does not wait for splats that reach only its neighbours. Several lanes have
-// the same sample, and test several splats at once. For the longest lists all warps of a block have one pixel.
+// How listed_blend (listed.cuh) composites a pixel by a queue. The pixel's lanes read its bits from filter, and queue
+// the splats that reach it, so it does not wait for splats that reach only its neighbours. Lanes that share a sample
+// test several queued splats at once. For the longest lists all warps of a block have one pixel.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
-/// A warp has kPixelsOfWarp pixels, or kWarpsOfPixel warps have different samples of one pixel. kAhead neighbouring
-/// lanes have the same sample.
+/// kWarpsOfPixel warps have different samples of one pixel. kAhead neighbouring lanes have the same sample.
 template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
 struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
@@ -25,7 +24,7 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   /// Lanes with the same sample.
   __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
   __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
-  /// Over the lanes of a pixel. All threads must call it.
+  /// All threads must call it.
   __device__ static float sum_lanes(float x) {
     x = Base::sum_lanes(x);
     if constexpr (kWarpsOfPixel > 1) {
@@ -56,13 +55,12 @@ template <class F, int kSide> __device__ int64_t pixel_words(int first, const Ti
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
-/// Checkpoints that are still to be stored for a list in segments of kSegment pairs: all in the first segment, and one
-/// before each other. The remaining ones are stored side by side by segment_maps_kernel.
+/// Checkpoints that listed_blend stores: all in the first segment, and one before each other. segment_maps stores the
+/// remaining ones side by side.
 template <int kSegment> struct CheckpointsAhead {
   int pair;  ///< after the next checkpoint
   float* to;
 
-  /// Stores the checkpoints before pairs up to k.
   template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
 #pragma unroll 1
     while (pair <= k) {
@@ -74,7 +72,7 @@ template <int kSegment> struct CheckpointsAhead {
   }
 };
 
-/// For each pixel of a warp the pairs that reach it, in the order of the list.
+/// For each pixel of a warp the pairs that reach it.
 template <class Layout> struct PairQueues {
   using Bits = uint16_t;
   static constexpr int kBits = 16;                        ///< that a lane reads at once
@@ -99,7 +97,7 @@ template <class Layout> struct PairQueues {
     fill();
   }
   __device__ bool has_bits() const { return next + kBits * lane < count; }
-  /// Reads bits until more than kAtOnce pairs are queued, or the list ends.
+  /// Until more than kAtOnce pairs are queued, or the list ends.
   __device__ void fill() {
     __syncwarp();
     const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
@@ -131,7 +129,7 @@ template <class F, int C> struct QueuedStage {
   int32_t queues[MomentPolicy::kQueued];
 };
 
-/// The next splats of a pixel, one in each lane, on their way from memory to QueuedStage.
+/// The next splats of a pixel, one in each lane, on their way to QueuedStage.
 template <class F, int C, class Layout> struct QueuedSplats {
   const float* splats_in;
   const Channels<float>& channels_in;
@@ -146,7 +144,6 @@ template <class F, int C, class Layout> struct QueuedSplats {
   __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
       : splats_in(params.splats), channels_in(params.channels), list(list), first_channel(first_channel) {}
 
-  /// Reads the splats of the claimed pairs, and claims the next.
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
@@ -165,8 +162,8 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
   /// `light`: the transmittance after the steps before.
   ///
-  /// The comparison is never true: a listed splat has a level above 0, and x_given_y is not negative. It keeps these
-  /// registers in use until the splat arrives. `light` makes the compiler compare after the steps.
+  /// The comparison is never true: level > 0, and x_given_y >= 0. It keeps these registers in use until the splat
+  /// arrives. `light` makes the compiler compare after the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
     if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
@@ -174,9 +171,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
 };
 
-/// Composites the staged splats, n of this lane's pixel from first_staged on. Most splats that reach a pixel show in no
-/// sample. So the lanes of a sample test kAhead splats at once and composite the first that shows. They test the later
-/// ones again, since the node has moved.
+/// Composites n staged splats of this lane's pixel, from first_staged on. Most show in no sample. So the lanes of a
+/// sample test kAhead splats at once and composite the first that shows. They test the later ones again, since the node
+/// has moved.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
@@ -234,8 +231,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   }
 }
 
-/// A warp blends its pixels by queues. Writes the channels [first, first + C). kKeep: for a backward pass. kSegment:
-/// pairs of a segment.
+/// Writes the channels [first, first + C).
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_queued(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {

@@ -1,5 +1,5 @@
-// A library for the backward kernels of moment/. VjpLane reads `last` and the gradient of the image for a lane's pixel.
-// It has the state that goes from splat to splat.
+// What a lane of the backward kernels of moment/ carries through a list (VjpLane): `last` and the gradient of the image
+// for its pixel, and the Adjoint that goes from splat to splat.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
@@ -58,7 +58,7 @@ template <class F, int C> struct SampleGrad {
   }
 };
 
-/// Number of pairs up to the last that was composited into each sample, and into any of the warp.
+/// Pairs up to the last that was composited into each sample, and into any of the warp.
 template <class F, class Layout> struct SamplesLast {
   int samples[Layout::kCells], warp = 0;
 
@@ -71,7 +71,7 @@ template <class F, class Layout> struct SamplesLast {
     }
     warp = warp_max(warp);
   }
-  /// Into any of the block. All threads must call it.
+  /// All threads must call it.
   __device__ int of_block(int (&of_warps)[Layout::kWarps]) const {
     if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
     __syncthreads();
@@ -82,13 +82,11 @@ template <class F, class Layout> struct SamplesLast {
   }
 };
 
-/// What a sample carries from a splat to the splat before it.
 struct Adjoint {
   float later;               ///< gradient-weighted colour of all later splats
   Vec2<float> dL_dposition;  ///< times F::kMoveGradUnit
 };
 
-/// A lane of a backward kernel, and its samples on their way through a list.
 template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout>> struct VjpLane {
   static constexpr int kCells = Layout::kCells;
   using Samples = MovingSamples<F, Layout, kTogether>;
@@ -104,7 +102,7 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
         corners(Layout::pixel()),
         samples(pixel.inside),
         last(params.last, pixel) {}
-  /// Reads the gradient of the image. `adjoint` is then that after all splats, where there is only the background.
+  /// After all splats there is only the background.
   __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
     grad.read(params, pixel, first, wanted);
 #pragma unroll

@@ -1,7 +1,6 @@
-// Kernel segment_vjp: the last step of the backward pass of moment/ for lists that are cut. blend_vjp_moment
-// (blend_vjp.cu) launches it after chain_maps. It reads the gradient of the image, checkpoints, `last` and splats, and
-// writes rows of pair_grads and channel_sums. A block claims a segment and goes back through it in batches. In each
-// batch its warps claim groups of pixels, which are unequal work. adjoint_maps keeps the Adjoints from batch to batch.
+// Kernel segment_vjp: the last step of the backward pass for lists that are cut. A block claims a segment and goes back
+// through it in batches. In each batch its warps claim groups of pixels, which are unequal work. adjoint_maps keeps the
+// Adjoints from batch to batch. It writes rows of pair_grads and channel_sums.
 #pragma once
 
 #include <algorithm>
@@ -78,8 +77,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     if (last[i] > k0) map_of(i).put(segment.number, lane.adjoint[i], kCarried);
 }
 
-/// A block claims one segment after another. Reads the channels [first, first + C) (template parameters: cells.cuh).
-/// `in_shared`: of EarlierPositions, which follow Shared in memory.
+/// Reads the channels [first, first + C). `in_shared`: of EarlierPositions, which follow Shared in memory.
 template <class F, int C, class Layout, int kSegment>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, true>)
     segment_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
@@ -129,7 +127,6 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   }
 }
 
-/// As many as can be resident.
 template <int C, class Layout> int64_t segment_vjp_blocks(int64_t segments) {
   return std::min(segments, int64_t(multiprocessors()) * kMovingVjpBlocks<C, Layout, true>);
 }

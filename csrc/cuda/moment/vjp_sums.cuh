@@ -1,5 +1,5 @@
-// A library for the backward kernels of moment/: sums over pixels, which are the gradient of a pair. Warps write sums
-// to shared memory or to group_sums. VjpBatch::write adds them up and writes rows of pair_grads and channel_sums.
+// Sums over pixels, which are the gradient of a pair, for the backward kernels of moment/. Warps write sums to shared
+// memory or to group_sums; VjpBatch::write adds them up and writes rows of pair_grads and channel_sums.
 #pragma once
 
 #include "cuda/moment/vjp_grads.cuh"
@@ -8,7 +8,7 @@ namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
-/// kPairs pairs in shared memory; with kInside also the sums of groups.
+/// With kInside also the sums of groups.
 template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatch {
   static constexpr int kBatch = kPairs, kChunks = kPairs / kStateChunk;
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
@@ -20,7 +20,6 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   Mat2<float> mean_maps[kPairs];
   std::conditional_t<kInside, SumsOfGroup[Layout::kGroups], char> inside;
 
-  /// Loads splat `id`, unless -1, of pair k0 + t.
   __device__ void load(int t, const BlendVjpParams& params, int first, const TileList& list, int k0, int32_t id,
                        bool with_means) {
     stage.load_one(t, params, first, list, id);
@@ -30,7 +29,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
   __device__ bool is_hit(int group, int j) const { return hits[group][j / kStateChunk] >> (j % kStateChunk) & 1; }
 
-  /// Writes total(j, v) of the first `count` pairs. PairGrad is added to that of earlier channels.
+  /// PairGrad is added to that of earlier channels.
   template <class Total>
   __device__ void write(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list, int count,
                         Total&& total) const {

@@ -1,10 +1,7 @@
-// Kernel moving_vjp: the backward pass of moment/ for lists that are not cut. blend_vjp_moment (blend_vjp.cu) launches
-// it. It reads splats, checkpoints, `last` and the gradient of the image, and writes rows of pair_grads and
-// channel_sums. segment_vjp also uses batch_vjp and launch_vjp.
-//
-// The state before a splat does not follow from the state after it. So a warp composites each chunk of 32 splats once
-// more from the checkpoint before it, and stores the positions before each splat. Then it walks back over the splats
-// that its pixels show.
+// Kernel moving_vjp: the backward pass for lists that are not cut. The state before a splat does not follow from the
+// state after it. So a warp composites each chunk of 32 splats once more from the checkpoint before it, and stores the
+// positions before each splat. Then it walks back over the splats that its pixels show. It writes rows of pair_grads
+// and channel_sums. segment_vjp shares batch_vjp and launch_vjp.
 #pragma once
 
 #include <algorithm>
@@ -20,8 +17,8 @@ template <int C, class Layout, bool kSegments>
 inline constexpr int kMovingVjpBlocks = blocks_per_sm(
     std::max(MomentPolicy::vjp_threads(C, Layout::kCells, kSegments) / Layout::kThreads, 1), Layout::kThreads);
 
-/// Positions of a lane's samples before each splat of a chunk that reaches its warp. The first in_shared are in shared
-/// memory, the others in local memory.
+/// Before each splat of a chunk that reaches the warp. The first in_shared are in shared memory, the others in local
+/// memory.
 template <class Layout> struct EarlierPositions {
   static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
   struct alignas(kTogether * sizeof(Vec2<float>)) Together {
@@ -67,8 +64,8 @@ template <class Layout> struct EarlierPositions {
   }
 };
 
-/// Composites the staged splats [from, from + 32) that reach the warp; pair k0 is staged first. Writes positions to
-/// `earlier`, unless null. Returns which listed splats any sample shows.
+/// Composites the staged splats [from, from + 32); pair k0 is staged first. Returns which listed splats any sample
+/// shows.
 template <class Stage, class F, int C, class Layout, bool kTogether, class Earlier>
 __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, Layout, kTogether>& lane,
                                  Earlier earlier) {
@@ -99,8 +96,7 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, L
   return warp_or(shown);
 }
 
-/// Takes a group back through the batch from pair k0 on, and writes its sums and hits. load(from) brings the samples to
-/// before staged splat `from`.
+/// Takes a group back through the batch from pair k0 on. load(from) brings the samples to before staged splat `from`.
 template <class F, int C, class Layout, bool kTogether, class Shared, class Load>
 __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int group, typename Shared::SumsOfGroup& sums,
                           const TileList& list, int k0, bool with_means, VjpLane<F, C, Layout, kTogether>& lane,
@@ -155,8 +151,7 @@ struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kState
   }
 };
 
-/// A block per tile whose list is not cut. Reads the channels [first, first + C) (template parameters: cells.cuh).
-/// `in_shared`: of EarlierPositions, which follow Shared in memory.
+/// A block per tile. Parameters as of segment_vjp_kernel.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, false>)
     moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {

@@ -1,6 +1,6 @@
-// Kernel moving_blend: the forward pass of moment/ for lists that are not cut into segments. blend_moment (blend.cu)
-// launches it. A block walks the whole list of a tile, since the position of a node depends on all earlier splats. It
-// reads plan, lists and splats and writes images, and for a backward pass transmittance, `last` and checkpoints.
+// Kernel moving_blend: the forward pass for lists that are not cut. A block walks the whole list of a tile, since the
+// position of a node depends on all earlier splats. It writes images, and for a backward pass transmittance, `last` and
+// checkpoints.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -13,9 +13,8 @@ inline constexpr int kMovingBlocks =
     blocks_per_sm(std::max(MomentPolicy::blend_threads(C) / Layout::kThreads, 1), Layout::kThreads);
 
 /// Block b has tile plan.tile_order[b], unless its list is cut; the last block only waits
-/// (begin_beside_earlier_kernels). Writes the channels [first, first + C) of the image, and alpha. `beside`:
-/// listed_blend_kernel was launched just before. kKeep: also writes transmittance, `last`, and checkpoints as
-/// TileCheckpoints and MovingSamples lay them out (other template parameters: cells.cuh).
+/// (begin_beside_earlier_kernels). Writes the channels [first, first + C). `beside`: listed_blend_kernel was launched
+/// just before. kKeep: writes checkpoints as TileCheckpoints and MovingSamples lay them out.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {

@@ -1,6 +1,5 @@
 // Cameras and lenses from what users give, and adjoints, for torch/cameras_cuda.cpp: small kernels, so that a frame
-// neither copies from the host nor waits for it. What limits a lens is searched by a block per direction and camera,
-// whose threads share the angles.
+// neither copies from the host nor waits for it. A block per direction and camera searches what limits a lens.
 #include "cuda/project/cameras.h"
 
 #include "cuda/launch.cuh"

@@ -13,7 +13,7 @@ struct LimitScratch {
   int32_t* seen;
 };
 
-/// Writes lenses and matrices. Source: CameraSource or LensSource of float or double.
+/// Source: CameraSource or LensSource of float or double.
 template <class Source> void prepare(const Source& source, const LimitScratch& scratch, cudaStream_t stream);
 template <typename T>
 void prepare_vjp(const CameraSource<T>& source, const CameraSourceGrads<T>& grads, cudaStream_t stream);

@@ -1,7 +1,6 @@
-// Three kernels of projection; forward.cu launches them. `project` writes the splats of Gaussians, radii, rows of
-// channels, and what bin reads (keys, counts and tiles). `project_rows` writes public rows (mean, covariance, opacity,
-// depth, colour), to keep or to send to another rank. `shape_rows` reads public rows, and writes splats and what bin
-// reads.
+// Kernels of projection. `project` writes splats of Gaussians, radii, rows of channels, and what bin reads (keys,
+// counts, tiles). `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or to send to
+// another rank. `shape_rows` turns public rows into splats.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -93,7 +92,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) project_kernel(const 
   }
 }
 
-/// A thread per Gaussian. Cam: as above. Writes rows, packed rows or flags.
+/// Writes rows, packed rows or flags.
 template <class Cam>
 __global__ void __launch_bounds__(ProjectPolicy::kThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
@@ -128,7 +127,6 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) project_rows_kernel(c
   write_row_or_flag(camera, params.rules, to, params.flags, i, mean.view, projected, splat.color, radius);
 }
 
-/// A thread per public row. Writes a splat and what bin reads.
 __global__ void __launch_bounds__(ProjectPolicy::kThreads) shape_rows_kernel(const ShapeRowsParams params) {
   wait_for_earlier_kernels();
   clear_counts(params);

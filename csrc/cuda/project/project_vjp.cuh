@@ -1,7 +1,6 @@
-// Kernels of the backward pass beside and after blend_vjp; backward.cu launches them. project_vjp takes sums of pairs,
-// or gradients of public rows, to gradients of Gaussians and, for each warp, of the camera. zero_culled_grads, beside
-// blend_vjp, reads only the ranges of pairs, and writes zeros for 32 adjacent Gaussians none of which has pairs. From
-// sums of pairs, row_grads writes gradients of public rows, and sum_channels of channels.
+// Kernels of the backward pass beside and after blend_vjp. project_vjp takes sums of pairs, or gradients of public
+// rows, to gradients of Gaussians and, for each warp, of the camera. zero_culled_grads writes zeros for 32 adjacent
+// Gaussians none of which has pairs. row_grads writes gradients of public rows, sum_channels of channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -48,7 +47,7 @@ struct SplatSums {
   }
 };
 
-/// Of splat i of each lane, in a fixed order. All lanes must call it.
+/// Of splat i of each lane, in a fixed order.
 __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
   SplatSums sums = {};
   const auto row = [&](int64_t k) { return pairs.pair_grads + k * kPairGradWidth; };
@@ -154,7 +153,7 @@ struct FromPairs {
   }
 };
 
-/// A source of project_vjp: gradients of public rows.
+/// A source: gradients of public rows.
 struct FromRows {
   using Params = ProjectRowsVjpParams;
   static constexpr bool kZeroed = false;
@@ -178,8 +177,7 @@ struct StagedGrads : AddedGrads<float> {
   __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
 };
 
-/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out:
-/// GaussianGrads<float>, or StagedGrads with FromRows.
+/// A thread per Gaussian. From: FromPairs or FromRows. Out: GaussianGrads<float>, or StagedGrads with FromRows.
 template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
 __global__ void __launch_bounds__(ProjectPolicy::kThreads,
                                   blocks_per_sm(Cam::kFull ? ProjectPolicy::kFullVjpBlocks : ProjectPolicy::kVjpBlocks,
@@ -238,7 +236,6 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads,
   }
 }
 
-/// A warp takes kGradRows adjacent Gaussians at a time.
 __global__ void __launch_bounds__(ProjectPolicy::kZeroThreads,
                                   blocks_per_sm(ProjectPolicy::kZeroBlocks, ProjectPolicy::kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
@@ -273,7 +270,6 @@ __global__ void __launch_bounds__(ProjectPolicy::kSumThreads)
   if (threadIdx.x == 0) *number.to = float(parts[0]);
 }
 
-/// A thread per row.
 __global__ void __launch_bounds__(ProjectPolicy::kThreads) row_grads_kernel(const RowGradsParams params) {
   wait_for_earlier_kernels();
   __shared__ float packed_rows[ProjectPolicy::kThreads * kPackedGradWidthAbsolute];
@@ -309,7 +305,6 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) row_grads_kernel(cons
   if (params.dL_dcolors) params.dL_dcolors[i] = sums.color();
 }
 
-/// A thread per splat.
 __global__ void __launch_bounds__(ProjectPolicy::kThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x, n = params.sums.n;

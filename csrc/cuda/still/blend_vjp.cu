@@ -1,5 +1,4 @@
-// Launches the backward kernel of footprints whose samples stay, for up to four channels. backward.cu calls
-// blend_vjp_still().
+// Launches blend_vjp (vjp.cuh): the backward pass of footprints whose samples stay, for up to four channels.
 #include "cuda/dispatch.h"
 #include "cuda/still/vjp.cuh"
 

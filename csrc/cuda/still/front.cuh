@@ -1,16 +1,7 @@
-// Kernel blend_front: the forward pass of footprints whose samples stay, for up to four channels. still/blend.cu
-// launches it, then the kernels of tail.cuh. They read lists, splats and the plan (plan.cuh), and write images,
-// checkpoints, `transmittance` and `last`.
-//
-// The first chunks of a list are the front, the others the tail:
-//
-//   `blend_front`    composites the front, until all pixels have stopped. A block per tile.
-//   `tail_through`   finds how much light each chunk of the tail lets through, if pixels are open. A block per chunk.
-//   `tail_scan`      multiplies these numbers up to the transmittance at the begin of each chunk.
-//   `tail_blend`     composites each chunk from this transmittance on. A block per chunk.
-//   `tail_sum`       adds the chunks up.
-//
-// So a few tiles with long lists fill the device too. The picture has the same bits with and without a backward pass.
+// Kernel blend_front: the forward pass of footprints whose samples stay, for up to four channels. It composites the
+// front, the first chunks of a list, until all pixels have stopped. The kernels of tail.cuh composite the other chunks
+// side by side, so that a few tiles with long lists fill the device too (docs/internals/kernels.md, "Forward: front and
+// tail"). The picture has the same bits with and without a backward pass.
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -1,4 +1,6 @@
-// A library for the kernels of front.cuh and tail.cuh: addresses of checkpoints, and the pixels of the images.
+// What blend_front and the tail share beside staged splats: addresses of a pixel's checkpoints (PixelCheckpoints,
+// TransmittancePlanes), store_pixel(), which writes a finished pixel to the images, and accumulate_farther(), which
+// turns the checkpoints into where blend_vjp starts.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"
@@ -9,7 +11,7 @@ __device__ inline int front_of(const BlendParams& params) {
   return front_chunks(params.grid, params.lists.counts->pairs, params.plan.blocks_at_once);
 }
 
-/// The checkpoints (CheckpointLayout) of a pixel of a tile. S samples, C channels.
+/// The checkpoints (CheckpointLayout) of a pixel.
 template <int S, int C, bool kKeep> struct PixelCheckpoints {
   float* base;  ///< first plane of the tile
   int first_chunk, pixel;
@@ -51,7 +53,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   }
 };
 
-/// The same for kernels that are compiled once for all S, C and kKeep: only the transmittance.
+/// For kernels that are compiled once for all S, C and kKeep.
 struct TransmittancePlanes {
   float* base;
   int first_chunk;
@@ -79,8 +81,7 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a complete pixel to the images. `total`: the channels of its samples in this lane. Samples: a footprint or
-/// LaneSamples. All lanes must call it.
+/// `total`: the channels of its samples in this lane. Samples: a footprint or LaneSamples. All lanes must call it.
 template <class Samples, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
                             const float (&transmittance)[Samples::kSamples]) {
@@ -104,8 +105,8 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> to
   if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
 
-/// Replaces the channels of each chunk in [first, end) by the channels of everything farther, where blend_vjp starts.
-/// `farther`: beyond the last of these chunks. kBatch chunks are loaded before the first store, to wait together.
+/// Replaces the channels of chunks [first, end) by those of everything farther, where blend_vjp starts. `farther`:
+/// beyond the last of these. kBatch chunks are loaded before the first store, to wait together.
 template <int kBatch, int S, int C>
 __device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
                                    Values<C> farther) {

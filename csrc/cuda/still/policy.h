@@ -1,4 +1,4 @@
-// Numbers of still/ that were chosen by measuring, with what they trade.
+// Numbers chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {

@@ -1,5 +1,5 @@
-// A library for the kernels of front.cuh and tail.cuh: splats that a block stages, lists of those that reach each
-// warp's pixels, and compositing.
+// How blend_front and the tail composite: a block stages splats, lists those that reach each warp's pixels, and
+// composite_all() blends them into the pixel of a lane.
 #pragma once
 
 #include <type_traits>
@@ -12,20 +12,20 @@ namespace ar::cuda {
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   static_assert(sizeof(TileSplat<F, C>) <= 112, "a splat in use is copied to registers");
   static constexpr int kBatch = kBlendThreads;
-  /// Whether lists have offsets in memory, read four at once: only with one sample, where this is much of the work.
+  /// Whether lists have offsets, read four at once: with one sample, where this is much of the work.
   static constexpr bool kOffsets = F::kSamples == 1;
   using Lists = std::conditional_t<kOffsets, ReachLists<uint32_t, sizeof(TileSplat<F, C>), 4, kSubtiles, kBatch>,
                                    ReachLists<uint8_t, 1, 1, kSubtiles, kBatch>>;
   Lists lists;
 
-  /// Lists the `count` staged splats that reach this warp's pixels, and returns how many do. All lanes must call it.
+  /// Those of the `count` staged splats that reach this warp's pixels.
   __device__ int list_reached(int count) { return lists.list(this->reach, 0, count); }
   template <class Visit> __device__ __forceinline__ void for_each_listed(int from, int to, Visit&& visit) const {
     lists.for_each(from, to, [&](auto entry) { visit(Lists::splat_of(this->splats, entry), entry); });
   }
 };
 
-/// Composites the staged splats into a pixel. `index`: of the first in the tile's list.
+/// `index`: of the first in the tile's list.
 template <class F, int C, int kSets>
 __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec2<float> p,
                               PixelState<F::kSamples, C, kSets>& state) {

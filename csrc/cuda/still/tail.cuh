@@ -1,5 +1,6 @@
-// Kernels that finish the tiles that blend_front has left open; front.cuh has an overview, still/blend.cu launches
-// them. They read lists, splats, the plan and `open_tiles`, and write checkpoints, `last`, transmittance and images.
+// Kernels that finish the tiles that blend_front has left open. tail_through finds how much light each chunk lets
+// through, tail_scan multiplies this up to the transmittance at the begin of each chunk, tail_blend composites each
+// chunk from there, and tail_sum adds the chunks up and writes images.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -10,7 +11,7 @@
 
 namespace ar::cuda {
 
-/// Calls visit(chunk, its list, its end in the list) for this block's tail chunks of open tiles.
+/// visit(chunk, its list, its end in the list) for this block's tail chunks of open tiles.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -49,8 +50,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
   });
 }
 
-/// The next splat, with alpha >= kAlphaMin, stops a sample with less transmittance: it may count as stopped. The margin
-/// covers rounding, which differs between chunks and splats.
+/// The next splat, with alpha >= kAlphaMin, stops a sample with less transmittance. The margin covers rounding, which
+/// differs between chunks and splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -61,8 +62,7 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
 /// Of 32 pixels, a block each.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// From what each chunk lets through to the transmittance at its begin, negative if the sample has stopped. `samples`:
-/// of a lane.
+/// Transmittance at the begin of a chunk is negative if the sample has stopped. `samples`: of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = StillPolicy::kTailLoads;

@@ -1,9 +1,7 @@
-// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. still/blend_vjp.cu
-// launches it. It reads the plan and what vjp_walk.cuh names, and writes rows of pair_grads.
-//
-// A warp goes through a chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp
-// makes the sums of a pair, without atomics, whose order would change from run to run. Only tiles that share the list
-// of a patch add to rows of splats by atomics.
+// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. A warp goes through a
+// chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp makes the sums of a
+// pair, without atomics, whose order would change from run to run. Only tiles that share the list of a patch use
+// atomics, on rows of splats.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -19,8 +17,7 @@ template <class F, int C> struct VjpShared {
   VjpBatch<F, C> batches[StillPolicy::kVjpWarps<F>];
 };
 
-/// F: what a lane blends. C: 3 channels in the splats, or up to 4 in rows. kMeans: with MeanSums. Each warp claims
-/// chunks until none is left.
+/// Parameters as of blend_front_kernel. kMeans: with MeanSums. Each warp claims chunks until none is left.
 template <class F, int C, bool kMeans>
 __global__ void __launch_bounds__(32 * StillPolicy::kVjpWarps<F>,
                                   blocks_per_sm(StillPolicy::kVjpBlocks<F, C>, 32 * StillPolicy::kVjpWarps<F>))

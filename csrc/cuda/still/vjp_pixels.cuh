@@ -1,17 +1,14 @@
-// A library for the kernel of still/vjp.cuh: the pixels of a tile in a warp of blend_vjp, one of each subtile per lane,
-// in registers or in shared memory.
+// The pixels of a tile in a warp of blend_vjp, one of each subtile per lane, in registers or in shared memory.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"
 
 namespace ar::cuda {
 
-/// Whether lanes keep their samples (VjpSample) in registers. Then each subtile has its own code, and shared memory has
-/// room for PairSums.
+/// Whether samples (VjpSample) are in registers. Then shared memory has room for PairSums.
 template <int C> inline constexpr bool kHoldsSamples = C == 3;
 
-/// Whether lanes keep the other numbers of pixels (VjpPixels) in registers too: worth more than the warps that do not
-/// fit then.
+/// Whether the other numbers of pixels (VjpPixels) are too: worth more than the warps that do not fit then.
 template <class F, int C> inline constexpr bool kHoldsPixels = kHoldsSamples<C> && F::kSamples == 1;
 
 /// Whether two subtiles, one below the other, share a branch: independent instructions, against visits in vain.
@@ -53,7 +50,7 @@ template <class F, int C> struct SharedPixels {
   VjpSample samples[F::kSamples][kHoldsSamples<C> ? 1 : kTilePixels];
 };
 
-/// The pixels of a lane, wherever they are; b: the subtile.
+/// b: the subtile.
 template <class F, int C> class LanePixels {
  public:
   __device__ explicit LanePixels(SharedPixels<F, C>& shared) : shared_(shared) {}
@@ -83,7 +80,7 @@ template <class F, int C> class LanePixels {
   VjpSample samples_[F::kSamples][kSubtiles];    ///< if kHoldsSamples
 };
 
-/// The k-th subtile that lanes visit: of a footprint one order for all C, so that all C have the same bits of sums.
+/// The k-th subtile that lanes visit: one order for all C, so that sums have the same bits.
 template <class F> constexpr int visited_subtile(int k) {
   return F::kSamples == 1 && !F::kExpensive ? (k & 4) | (k & 1) << 1 | (k >> 1 & 1) : k;
 }

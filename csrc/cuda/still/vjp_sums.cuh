@@ -1,13 +1,13 @@
-// A library for the kernel of still/vjp.cuh: splats that a warp of blend_vjp has listed, and PairSums, which adds the
-// sums of eight pairs over the lanes in shared memory.
+// Splats that a warp of blend_vjp has listed, and PairSums, which adds the sums of eight pairs over the lanes in shared
+// memory.
 #pragma once
 
 #include "cuda/still/vjp_pixels.cuh"
 
 namespace ar::cuda {
 
-/// Sums of nine values over the lanes for kPairs pairs together: 17 instructions per pair, where sum_values takes 60.
-/// The order of additions is that of sum_values, so that both give the same bits.
+/// Nine values of kPairs pairs together: 17 instructions per pair, where sum_values takes 60. Both add in the same
+/// order.
 struct PairSums {
   static constexpr int kPairs = 8, kValues = 9;
   struct Pair {

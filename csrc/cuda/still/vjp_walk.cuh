@@ -1,6 +1,4 @@
-// A library for the kernel of still/vjp.cuh: a warp of blend_vjp takes the pixels of a tile back to front through a
-// chunk. It reads lists, splats, checkpoints, `last`, `transmittance` and gradients of images, and writes rows of
-// pair_grads.
+// How a warp of blend_vjp takes the pixels of a tile back to front through a chunk, and writes rows of pair_grads.
 #pragma once
 
 #include "cuda/still/vjp_sums.cuh"
@@ -34,8 +32,7 @@ struct VjpChunk {
   }
 };
 
-/// Pairs of the list up to the last that any pixel composited. Also writes batch.subtile_last; __syncwarp() must
-/// follow.
+/// Pairs up to the last that any pixel composited. Also writes batch.subtile_last; __syncwarp() must follow.
 template <class F, class Batch>
 __device__ __forceinline__ int find_last(const BlendVjpParams& params, const VjpChunk& chunk, Batch& batch) {
   const int lane = lane_id();
@@ -53,8 +50,7 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
   return tile_last;
 }
 
-/// The state of pixels and samples after the chunk. `final`: only the background follows. checkpoints: [samples,
-/// kTilePixels] after the chunk.
+/// `final`: only the background follows. checkpoints: [samples, kTilePixels] after the chunk.
 template <class F, int C>
 __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const VjpChunk& chunk,
                                              const Checkpoint<C>* checkpoints, bool final, LanePixels<F, C>& pixels) {
@@ -107,7 +103,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
                                        VjpBatch<F, C>& batch)
       : params_(params), chunk_(chunk), list_(chunk.list), pixels_(pixels), batch_(batch) {}
 
-  /// In batches of 32 pairs: lists pairs that reach a pixel, then walks them. `tile_last`: of find_last().
+  /// In batches of 32 pairs: lists those that reach a pixel, then walks them.
   __device__ __forceinline__ void run(int tile_last) {
     static_assert(kChunkLength % 32 == 0);  // no batch begins before the chunk
     for (int k1 = min(chunk_.end, tile_last); k1 > chunk_.begin; k1 = (k1 - 1) / 32 * 32) {
@@ -163,7 +159,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Takes pixels through a splat. `to`: a PairSums::Pair, or the index in the list.
+  /// `to`: a PairSums::Pair, or the index in the list.
   template <MeanSums kKind, class To>
   __device__ void walk(const ListedSplat<F, C>& listed, int k0, const Mat2<float>& mean_map, To&& to) {
     const ListedSplat<F, C> splat = listed;
@@ -190,8 +186,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Takes the pixel of subtile b, at p, from after a splat to before it. `at`: the pair, by reference because the
-  /// compiler else turns comparisons around.
+  /// The pixel of subtile b is at p. `at`: the pair, by reference because the compiler else turns comparisons around.
   template <MeanSums kKind>
   __device__ void add_pixel(const ListedSplat<F, C>& splat, const int& at, const Mat2<float>& mean_map, int b,
                             Vec2<float> p, ShapeGrad<float>& shape, float& weighted, Values<C>& channels,

@@ -60,7 +60,7 @@ __device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
 
 inline constexpr int kClearThreads = kChannelGroup / 4;
 
-/// The same by kClearThreads neighbouring threads: in pair_grads, if `shapes`, and in channel_sums [rows, kWidth].
+/// The same by kClearThreads neighbouring threads, also in channel_sums [rows, kWidth]. `shapes`: in pair_grads.
 template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
   const int q = threadIdx.x % kClearThreads;
   const float4 zero = {0, 0, 0, 0};

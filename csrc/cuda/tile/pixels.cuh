@@ -1,9 +1,9 @@
 // The pixels of a tile: which lane has which pixel or sample, what it keeps between splats, and where it writes.
 //
-// A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one subtile, in still/vjp.cuh all eight.
-// Subtile b is in column b % 2 and row b / 2 of the tile. Lane l has the pixel in column l % 8 and row l / 8 of the
-// subtile. With a Spread (core/footprint/contract.h) a lane has one sample: neighbouring lanes share a pixel, and the
-// tile has fewer pixels.
+// A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one, in still/vjp.cuh all. Subtile b is
+// in column b % 2 and row b / 2 of the tile, and the pixel of lane l in column l % 8 and row l / 8 of the subtile. With
+// a Spread (core/footprint/contract.h) a lane has one sample: neighbouring lanes share a pixel, and the tile has fewer
+// pixels.
 #pragma once
 
 #include "core/blend.h"
@@ -32,8 +32,8 @@ template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
   const int pixel = lane / F::kLanes;
   return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
 }
-/// The position of a lane's sample in subtile b; `of_first`: in subtile 0. blend and blend_vjp share this addition,
-/// because alpha must have the same bits in both.
+/// The position of a lane's sample in subtile b; `of_first`: in subtile 0. alpha must have the same bits in blend and
+/// blend_vjp.
 template <class F> __device__ Vec2<float> position_in(int b, Vec2<float> of_first) {
   return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
 }
@@ -100,8 +100,8 @@ template <int C> struct Values {
 };
 template <> struct Values<0> {};
 
-/// The state of a lane's S samples between splats. kSets sets of C channels: 1, or S if checkpoints need them. The
-/// transmittance of a sample that has stopped is negative.
+/// Of a lane's S samples between splats. kSets sets of C channels: 1, or S if checkpoints need them. The transmittance
+/// of a sample that has stopped is negative.
 template <int S, int C, int kSets> struct PixelState {
   float transmittance[S];
   Values<C> channels[kSets];
@@ -130,7 +130,7 @@ template <int S, int C, int kSets> struct PixelState {
   }
 };
 
-/// Adds what a splat contributes to the S samples of a lane. composite(s): blend_sample() of sample s.
+/// composite(s): blend_sample() of sample s.
 template <int S, int C, class Composite>
 __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
   float contribution = 0;

@@ -53,8 +53,8 @@ template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& spla
   return reached_boxes<kSubtileWide<F>, kSubtileHigh<F>, 2, 4, F>(splat, x0, y0);
 }
 
-/// For each of kWarps warps a list of up to kMost staged splats that reach its pixels: cheaper to walk than a mask. An
-/// entry is an index times kUnit: an offset in memory with kUnit = sizeof(splat). kAhead entries are read at once.
+/// For each warp a list of up to kMost staged splats that reach its pixels: cheaper to walk than a mask. An entry is an
+/// index times kUnit (an offset in memory with kUnit = sizeof(splat)); kAhead are read at once.
 template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct ReachLists {
   using Entry = EntryType;
   struct alignas(kAhead * sizeof(Entry)) Entries {
@@ -62,8 +62,7 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   };
   alignas(Entries) Entry of_warps[kWarps][kMost];
 
-  /// Lists splats k in [from, to) with bit `number` in reach[k], which is read up to the next multiple of 32. Returns
-  /// how many there are. All lanes must call it.
+  /// Lists splats k in [from, to) with bit `number` in reach[k], which is read up to the next multiple of 32.
   template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number = int(threadIdx.x) / 32) {
     const int warp = threadIdx.x / 32;
     int n = 0;

@@ -11,7 +11,6 @@ template <class F> __device__ Splat<F, float> load_splat(const float* splats, in
 }
 __device__ inline void prefetch_splat(const float* splats, int32_t id) { prefetch(splats + int64_t(id) * kSplatWidth); }
 
-/// A staged splat.
 template <class F, int C> struct alignas(16) TileSplat {
   typename F::template Terms<float> terms;
   Values<C> channels;
@@ -44,12 +43,11 @@ template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, cons
   return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
 }
 
-/// Splats that a block works on together.
 template <class F, int C, int kBatch> struct Stage {
   TileSplat<F, C> splats[kBatch];
   uint8_t reach[kBatch];
 
-  /// Loads pairs [k, k + kBatch), one per thread, and returns how many are before `end`. splats_in: [n, kSplatWidth].
+  /// Loads pairs [k, k + kBatch), one per thread, and returns how many are before `end`.
   __device__ int load(const float* splats_in, const Channels<float>& channels, const TileList& list, int k, int end) {
     const int t = threadIdx.x;
     if (kBatch == kBlendThreads || t < kBatch) {
@@ -65,7 +63,7 @@ template <class F, int C, int kBatch> struct Stage {
     return min(end - k, kBatch);
   }
 
-  /// Splats [k, k + 32) that reach a subtile, for take_first(). All lanes must call it.
+  /// Splats [k, k + 32) that reach a subtile, for take_first().
   __device__ uint32_t reached(int k, int subtile = threadIdx.x / 32) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }

@@ -1,6 +1,5 @@
-// What a training does to each Gaussian by itself, for torch/training_cuda.cpp: activations, the 3D filter, both
-// adjoints, and what density control observes and adds. Kernels with a thread per Gaussian; core/activations.h and
-// core/density.h say what they read and write. `sum_penalty` adds up what the blocks of `activate` have of the penalty.
+// What a training does to each Gaussian by itself: core/activations.h and core/density.h, a thread per Gaussian.
+// `sum_penalty` adds up what the blocks of `activate` have of the penalty.
 #include "core/activations.h"
 #include "core/density.h"
 

@@ -1,5 +1,4 @@
-// The correction of a picture's colours and its adjoint, for torch/training_cuda.cpp. Kernels `correct` and
-// `correct_vjp` have kPixels pixels for each thread. `correct_vjp` writes sums of blocks for the gradient of the
+// The correction of a picture's colours and its adjoint. `correct_vjp` writes sums of blocks for the gradient of the
 // matrix, and `sum_blocks` adds these up in a fixed order.
 #include "core/color_correction.h"
 

@@ -1,9 +1,9 @@
-// The similarity of two images, a loss made of it and l1, and the adjoint, for torch/training_cuda.cpp. Three kernels:
-// `ssim` reads images, and writes similarities, partial derivatives and sums of blocks. `loss` adds these sums up in
-// a fixed order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
+// The similarity of two images, a loss made of it and l1, and the adjoint. `ssim` writes similarities, partial
+// derivatives and sums of blocks, `loss` adds these sums up in a fixed order, and `ssim_vjp` makes the gradient of the
+// image from the partial derivatives.
 //
-// A block has a tile of pixels: it copies what windows reach to shared memory, sums along rows, then along columns. A
-// thread makes kRun neighbouring sums from registers, to load less from shared memory.
+// A block copies what the windows of its pixels reach to shared memory, sums along rows, then along columns. A thread
+// makes kRun neighbouring sums from registers, to load less from shared memory.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
@@ -74,7 +74,6 @@ template <typename T, int kRun> __device__ void sum_run(const T (&v)[kRun + kRea
   for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
 }
 
-/// From sums along rows.
 template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[Tile<T>::kRun]) {
   using Tile = Tile<T>;
   const int column = threadIdx.x % Tile::kColumns, row = threadIdx.x / Tile::kColumns * Tile::kRun;

@@ -1,6 +1,6 @@
-// What torch/training_cuda.cpp calls for a training step besides rendering: ssim.cu, activations.cu, adam.cu,
-// color_correction.cu. Pointers are views of device memory. Functions enqueue kernels on a stream, and do not wait.
-// Bits do not depend on the order of blocks. T: float or double.
+// What torch/training_cuda.cpp calls for a training step besides rendering; each function is in the file of its name.
+// Pointers are device memory. Nothing waits for the device. Bits do not depend on the order of blocks. T: float or
+// double.
 #pragma once
 
 #include <cuda_runtime_api.h>
