@@ -227,6 +227,28 @@ def _(a):
     return _gradients(a, "composite")
 
 
+@_register("repeat_at_seam")
+def _(a):
+    context = torch.library.get_ctx()
+    rows = context.new_dynamic_size()
+    names = ("means2d", "cov2d", "opacities", "depths", "colors", "beside", "radii", "gaussian_ids", "camera_ids", "dets")
+    given = [getattr(a, name) for name in names]
+    made = [a.means2d.new_empty(0) if t is None else t.new_empty(rows, *t.shape[1:]) for t in given]
+    if a.colors.shape[0] == 0:
+        made[names.index("colors")] = a.colors.new_empty(a.colors.shape)
+    count, longs = a.means2d.shape[0], {"dtype": torch.int64}
+    saved = []
+    if a.keep:
+        saved = [a.means2d.new_empty(n, **longs) for n in (count, rows)]
+        saved += [a.means2d.new_empty(context.new_dynamic_size())]
+    return *made, a.row_splits.new_empty(a.row_splits.shape), saved
+
+
+@_register("repeat_at_seam_vjp")
+def _(a):
+    return _gradients(a, "repeat_at_seam")
+
+
 @_register("count_rows")
 def _(a):
     return a.means3D.new_empty(a.viewmatrix.shape[0], a.means3D.shape[0], dtype=torch.int32)
@@ -379,6 +401,12 @@ def _(a):
     image = a.means.new_empty(a.target.shape)
     radii = a.means.new_empty(a.means.shape[0], dtype=torch.int32)
     return a.means.new_empty(()), image, radii, gradients
+
+
+@_register("rows_picture_gradients")
+def _(a):
+    rows = a.rows.new_empty(a.rows.shape[0], _C.ROW_GRAD_WIDTHS[int(a.absolute)])
+    return a.rows.new_empty(()), a.rows.new_empty(a.target.shape), rows
 
 
 @_register("observe_")

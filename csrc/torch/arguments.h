@@ -280,6 +280,33 @@ struct CompositeArguments : ImageArguments {
   }
 };
 
+/// Rows of which those of pictures with a seam are repeated.
+struct SeamArguments : ImageArguments {
+  Tensor means2d, cov2d, opacities, depths, colors;  ///< Colours (N, 3), or (0, 3).
+  Tensor turns;           ///< (C,) px of a turn of each camera, infinite without a seam.
+  OptionalTensor beside;  ///< (N, K), repeated too.
+  Tensor radii, gaussian_ids, camera_ids, dets, row_splits;
+  bool keep = false;
+
+  static constexpr size_t kTensors = 12;
+  template <class Visit> void each(Visit&& visit) {
+    visit("means2d", means2d);
+    visit("cov2d", cov2d);
+    visit("opacities", opacities);
+    visit("depths", depths);
+    visit("colors", colors);
+    visit("turns", turns);
+    visit("beside", beside);
+    visit("radii", radii);
+    visit("gaussian_ids", gaussian_ids);
+    visit("camera_ids", camera_ids);
+    visit("dets", dets);
+    visit("row_splits", row_splits);
+    ImageArguments::each(visit);
+    visit("keep=False", keep);
+  }
+};
+
 struct InspectArguments : ImageArguments {
   std::vector<Tensor> lists;  ///< Of `bin`, of one camera.
   Tensor depths;              ///< (N,) of the rows.

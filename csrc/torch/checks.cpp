@@ -287,6 +287,28 @@ void check(CompositeArguments& a) {
   background = given < channels ? at::constant_pad_nd(background, {0, channels - given}) : background.contiguous();
 }
 
+void check(SeamArguments& a) {
+  check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
+  const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
+  const Like like{a.means2d, "means2d"};
+  like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  like.check_type(a.colors, "colors");
+  check_shape(a.colors.dim() == 2 && (a.colors.size(0) == n || a.colors.size(0) == 0), a.colors, "colors",
+              "(N, K) or (0, K) with N = ", n);
+  like.check_vector(a.turns, "turns", cameras);
+  if (a.beside) {
+    like.check_type(*a.beside, "beside");
+    check_shape(a.beside->dim() == 2 && a.beside->size(0) == n, *a.beside, "beside", "(N, K) with N = ", n);
+  }
+  const std::pair<Tensor*, const char*> whole[] = {
+      {&a.radii, "radii"}, {&a.gaussian_ids, "gaussian_ids"}, {&a.camera_ids, "camera_ids"}};
+  for (const auto& [t, name] : whole) {
+    TORCH_CHECK_TYPE(t->scalar_type() == at::kInt, name, " must have dtype int32, got ", t->scalar_type());
+    check_rows(*t, name, n, {}, "(N,)");
+  }
+  check_image_size(a.image_height, a.image_width);
+}
+
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);

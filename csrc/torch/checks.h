@@ -17,6 +17,7 @@ void check_values(const RasterizeArguments& a);
 void check(BinArguments& a);
 void check(BlendArguments& a, const Pass& pass);
 void check(CompositeArguments& a);
+void check(SeamArguments& a);
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);
 void check(SsimArguments& a);
@@ -26,6 +27,7 @@ void check(ObserveArguments& a);
 void check(NoiseArguments& a);
 /// What the ops inside would find late, or by another name.
 void check(PictureArguments& a);
+void check(RowsPictureArguments& a);
 void check(CorrectArguments& a);
 void check(AdamArguments& a);
 

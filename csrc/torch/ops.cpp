@@ -72,6 +72,10 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
   visit(Op<CompositeArguments, composite>{}, "composite", blended);
   visit(Op<VjpArguments<CompositeArguments>, composite_vjp>{}, "composite_vjp", gradients);
+  visit(Op<SeamArguments, repeat_at_seam>{}, "repeat_at_seam",
+        "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor beside, Tensor radii, "
+        "Tensor gaussian_ids, Tensor camera_ids, Tensor dets, Tensor row_splits, Tensor[] saved");
+  visit(Op<VjpArguments<SeamArguments>, repeat_at_seam_vjp>{}, "repeat_at_seam_vjp", gradients);
   visit(Op<BatchArguments, count_rows>{}, "count_rows", "Tensor ends");
   visit(Op<PackArguments, pack_rows>{}, "pack_rows_", "");
   visit(Op<PackVjpArguments, pack_rows_vjp>{}, "pack_rows_vjp", gradients);
@@ -96,6 +100,8 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<CorrectArguments>, correct_colors_vjp>{}, "correct_colors_vjp", gradients);
   visit(Op<PictureArguments, picture_gradients>{}, "picture_gradients",
         "Tensor loss, Tensor image, Tensor radii, Tensor[] gradients");
+  visit(Op<RowsPictureArguments, rows_picture_gradients>{}, "rows_picture_gradients",
+        "Tensor loss, Tensor image, Tensor dL_drows");
   visit(Op<ObserveArguments, observe>{}, "observe_", "");
   visit(Op<NoiseArguments, add_noise>{}, "add_noise_", "");
   visit(Op<AdamArguments, adam>{}, "adam_", "");
@@ -149,22 +155,12 @@ template <size_t kCount> std::vector<std::string> names_of(const std::array<cons
   return names;
 }
 
-/// Bounds of how far splats reach with a footprint: variance that it adds [px^2], level at opacity 1, and a factor for
-/// rounding. A splat of variance v and opacity a shows within factor * sqrt((v + variance) * (level + max(0, 2 log a)))
-/// of its mean along an axis, or 2 px more.
-std::tuple<double, double, double> reach_bounds(const std::string& footprint, double option) {
-  const CullBounds<double> bounds = cull_bounds<double>(find_footprint(footprint, option).choice);
-  return {bounds.variance, bounds.level, double(kReachMargin)};
-}
-
 /// (name, size) of the members of Lens.
 std::vector<std::pair<std::string, int>> lens_members() {
   std::vector<std::pair<std::string, int>> members;
   for (const LensMember& member : kLensMembers) members.emplace_back(member.name, member.size);
   return members;
 }
-
-/// In the order of their numbers.
 
 /// As Python indexes them.
 pybind11::object columns_at(int64_t first, int64_t count) {
@@ -263,7 +259,6 @@ PYBIND11_MODULE(_C, m) {
   m.def("lens_reach", &ar::ops::lens_reach, "The angle up to which a picture sees, and more (csrc/torch/cameras.cpp).",
         pybind11::arg("model"), pybind11::arg("distortion"), pybind11::arg("tan_x"), pybind11::arg("tan_y"),
         pybind11::arg("x"), pybind11::arg("y"), pybind11::arg("height") = 0);
-  m.def("reach_bounds", &ar::ops::reach_bounds, "Bounds of how far splats reach (csrc/torch/ops.cpp).");
   m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::ops::kCameraModelNames);
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();

@@ -44,6 +44,12 @@ Results project_vjp(VjpArguments<ProjectArguments> a);
 Results composite(CompositeArguments a);
 Results composite_vjp(VjpArguments<CompositeArguments> a);
 
+/// Rows: means2d, cov2d, opacities, depths, colors, beside; radii, gaussian_ids, camera_ids, dets, row_splits; saved.
+Results repeat_at_seam(SeamArguments a);
+Results repeat_at_seam_vjp(VjpArguments<SeamArguments> a);
+/// Of rows of copies the sums over those of each of `counts` (n,), in order.
+Tensor summed_copies(const Tensor& of_copies, const Tensor& counts);
+
 /// ends (C, P) int32: how many Gaussians up to each one have a row.
 Results count_rows(BatchArguments a);
 /// Writes rows, radii, ids.
@@ -89,6 +95,8 @@ Results correct_colors_vjp(VjpArguments<CorrectArguments> a);
 /// loss (); image (3, H, W) as compared with the target, but for the mask; radii (P,) int32; gradients: of means,
 /// log_scales, quats, logit_opacities, shs, with mean_columns means2D, with an exposure its matrix.
 Results picture_gradients(PictureArguments a);
+/// loss (); image (3, H, W); dL_drows (n, kPackedGradWidth or kPackedGradWidthAbsolute).
+Results rows_picture_gradients(RowsPictureArguments a);
 
 /// Writes gradient_sums, views.
 Results observe(ObserveArguments a);

@@ -1,16 +1,21 @@
-// The op picture_gradients: activations, 3D filter, rendering and loss of a training's picture, and the gradients of
-// the parameters. It calls the ops that autograd would call, in the same order, and saves the host the cost of
-// autograd.
+// The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients of
+// the parameters or, where these are on several ranks, of rows. They call the ops that autograd would call, in the same
+// order, and save the host the cost of autograd.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
+#include <ATen/ops/full.h>
+#include <ATen/ops/zeros.h>
 
 #include <algorithm>
+#include <iterator>
 
 #include "torch/checks.h"
 #include "torch/ops.h"
 
 namespace ar::ops {
 namespace {
+
+std::vector<Tensor> gradients_of(const Results& of_vjp) { return of_vjp[0].toTensorVector(); }
 
 RasterizeArguments scene_of(const PictureArguments& a, const Results& activated) {
   RasterizeArguments scene;
@@ -31,22 +36,117 @@ RasterizeArguments scene_of(const PictureArguments& a, const Results& activated)
   return scene;
 }
 
-/// With a mask as `counted` in losses.py.
-L1SsimArguments comparison_of(const PictureArguments& a, const Tensor& image) {
-  L1SsimArguments comparison;
-  comparison.image = image;
-  comparison.target = a.target;
-  if (a.mask) {
-    const bool levels = a.target.scalar_type() == at::kByte;
-    comparison.image = comparison.image.mul(*a.mask);
-    comparison.target = (levels ? a.target.to(image.scalar_type()).div(255) : a.target).mul(*a.mask);
+/// Of the op `rasterize` for the parameters' scene.
+struct SceneGrads {
+  Tensor means3D, means2D, opacities, shs, scales, rotations;
+};
+
+struct Rasterized {
+  RasterizeArguments scene;
+  Results results;
+  Tensor image, radii;
+
+  explicit Rasterized(const RasterizeArguments& a) : scene(a), results(rasterize(a)) {
+    image = results[0].toTensor();
+    radii = results[2].toTensor();
   }
-  comparison.keep = true;
-  comparison.l1_weight = 1 - a.ssim_weight;
-  comparison.ssim_weight = -a.ssim_weight;
-  comparison.constant = a.ssim_weight;
-  return comparison;
-}
+  SceneGrads vjp(const Tensor& dL_dimage) const {
+    std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
+    for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
+    needs[1] = scene.means2D.has_value();
+    const std::vector<Tensor> g =
+        gradients_of(rasterize_vjp({{dL_dimage}, scene, results.back().toTensorVector(), needs}));
+    return {g[0], g[1], g[2], g[3], g[5], g[6]};
+  }
+};
+
+/// The same of an equirectangular picture, between whose stages splats are repeated. The host waits for their number.
+struct Sphere {
+  RasterizeArguments scene;
+  ProjectArguments camera;
+  SeamArguments seam;
+  BlendArguments rows;
+  Results projected, repeated, blended;
+  Tensor image, radii;
+
+  Sphere(const RasterizeArguments& a, double turn) : scene(a) {
+    static_cast<SceneTensors<OptionalTensor>&>(camera) = a;
+    camera.means2D = std::nullopt;
+    static_cast<FootprintArguments&>(camera) = a;
+    camera.image_height = seam.image_height = rows.image_height = a.image_height;
+    camera.image_width = seam.image_width = rows.image_width = a.image_width;
+    camera.tanfovx = {a.tanfovx};
+    camera.tanfovy = {a.tanfovy};
+    camera.scale_modifier = a.scale_modifier;
+    camera.sh_degree = a.sh_degree;
+    camera.keep = seam.keep = rows.keep = true;
+    projected = project(camera);
+    const Tensor means2d = projected[0].toTensor(), ids = projected[6].toTensor();
+    radii = at::zeros({a.means3D.size(0)}, ids.options()).index_copy_(0, ids.to(at::kLong), projected[5].toTensor());
+
+    static_cast<FootprintArguments&>(seam) = a;
+    Tensor* const given[] = {&seam.means2d, &seam.cov2d,        &seam.opacities,  &seam.depths,    &seam.colors,
+                             &seam.radii,   &seam.gaussian_ids, &seam.camera_ids, &seam.row_splits, &seam.dets};
+    for (size_t k = 0; k < std::size(given); ++k) *given[k] = projected[k].toTensor();
+    seam.turns = at::full({1}, turn, means2d.options());
+    repeated = repeat_at_seam(seam);
+
+    static_cast<FootprintArguments&>(rows) = a;
+    rows.means2d = repeated[0].toTensor();
+    rows.cov2d = repeated[1].toTensor();
+    rows.opacities = repeated[2].toTensor();
+    rows.features = repeated[4].toTensor();
+    rows.background = a.bg.unsqueeze(0);
+    rows.dets = repeated[9].toTensor();
+    rows.row_splits = repeated[10].toTensor();
+    if (columns() == 4) rows.means2d_abs = at::empty(rows.means2d.sizes(), means2d.options());
+    BinArguments listed;
+    static_cast<ImageArguments&>(listed) = rows;
+    listed.means2d = rows.means2d;
+    listed.cov2d = rows.cov2d;
+    listed.dets = rows.dets;
+    listed.opacities = rows.opacities;
+    listed.depths = repeated[3].toTensor();
+    listed.row_splits = rows.row_splits;
+    rows.lists = bin(listed)[0].toTensorVector();
+    blended = blend(rows);
+    image = blended[0].toTensor()[0];
+  }
+  int64_t columns() const { return scene.means2D ? scene.means2D->size(1) : 0; }
+
+  SceneGrads vjp(const Tensor& dL_dimage) const {
+    const bool absolute = columns() == 4;
+    const std::vector<Tensor> of_rows =
+        gradients_of(blend_vjp({{dL_dimage.unsqueeze(0)},
+                                rows,
+                                blended.back().toTensorVector(),
+                                {true, true, true, true, false, absolute, false, false}}));
+    const std::vector<Tensor> saved = repeated.back().toTensorVector();
+    std::vector<bool> needs(SeamArguments::kTensors, false);
+    for (const size_t k : {0, 1, 2, 4}) needs[k] = true;  // means2d, cov2d, opacities, colors.
+    const std::vector<Tensor> of_splats = gradients_of(
+        repeat_at_seam_vjp({{of_rows[0], of_rows[1], of_rows[2], std::nullopt, of_rows[3]}, seam, saved, needs}));
+    needs.assign(kSceneTensors, false);                      // Of these all but means2D, and values.
+    for (const size_t k : {0, 1, 2, 4, 5}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
+    const std::vector<Tensor> g =
+        gradients_of(project_vjp({{of_splats[0], of_splats[1], of_splats[2], std::nullopt, of_splats[4]},
+                                  camera,
+                                  projected.back().toTensorVector(),
+                                  needs}));
+    SceneGrads grads = {g[0], {}, g[1].view_as(scene.opacities), g[2], g[4], g[5]};
+    if (columns() == 0) return grads;
+    // By normalized device coordinates.
+    std::vector<Tensor> parts = {of_splats[0]};
+    if (absolute) parts.push_back(summed_copies(of_rows[5], saved[0]));
+    grads.means2D = at::zeros(scene.means2D->sizes(), image.options());
+    const Tensor ids = seam.gaussian_ids.to(at::kLong);
+    for (size_t k = 0; k < parts.size(); ++k) {
+      grads.means2D.select(1, 2 * k).index_copy_(0, ids, parts[k].select(1, 0).mul(scene.image_width / 2.0));
+      grads.means2D.select(1, 2 * k + 1).index_copy_(0, ids, parts[k].select(1, 1).mul(scene.image_height / 2.0));
+    }
+    return grads;
+  }
+};
 
 /// Activations, with the regularizers as their penalty.
 ActivateArguments parameters_of(const PictureArguments& a) {
@@ -64,12 +164,49 @@ Tensor averaged_vjp(const Tensor& dL_daveraged, const Tensor& image, int64_t tim
                                  /*count_include_pad=*/true, /*divisor_override=*/std::nullopt);
 }
 
-std::vector<Tensor> gradients_of(const Results& of_vjp) { return of_vjp[0].toTensorVector(); }
+/// With a mask as `counted` in losses.py.
+L1SsimArguments comparison_of(const LossArguments& a, const Tensor& image) {
+  L1SsimArguments comparison;
+  comparison.image = image;
+  comparison.target = a.target;
+  if (a.mask) {
+    const bool levels = a.target.scalar_type() == at::kByte;
+    comparison.image = comparison.image.mul(*a.mask);
+    comparison.target = (levels ? a.target.to(image.scalar_type()).div(255) : a.target).mul(*a.mask);
+  }
+  comparison.keep = true;
+  comparison.l1_weight = 1 - a.ssim_weight;
+  comparison.ssim_weight = -a.ssim_weight;
+  comparison.constant = a.ssim_weight;
+  return comparison;
+}
 
-}  // namespace
+/// The loss of a rendering, and its gradients.
+struct Loss {
+  Tensor value, shown;  ///< (), and the image as compared with the target, but for the mask.
+  Tensor dL_drendered, dL_dexposure;
 
-Results picture_gradients(PictureArguments a) {
-  check(a);
+  Loss(const LossArguments& a, const Tensor& rendered) {
+    const Tensor image = averaged(rendered, a.supersampling);
+    shown = a.exposure ? correct_colors({image, *a.exposure})[0].toTensor() : image;
+    const L1SsimArguments comparison = comparison_of(a, shown);
+    const Results compared = l1_ssim(comparison);
+    value = compared[0].toTensor();
+    Tensor dL_dimage =
+        gradients_of(l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}}))[0];
+    if (a.mask) dL_dimage = dL_dimage.mul(*a.mask);
+    if (a.exposure) {
+      const std::vector<Tensor> of_correction =
+          gradients_of(correct_colors_vjp({{dL_dimage}, {image, *a.exposure}, {}, {true, true}}));
+      dL_dimage = of_correction[0];
+      dL_dexposure = of_correction[1];
+    }
+    dL_drendered = averaged_vjp(dL_dimage, rendered, a.supersampling);
+  }
+};
+
+/// What the two ways of rendering have in common.
+template <class Rendering> Results gradients_through(const PictureArguments& a, const Rendering& render) {
   const ActivateArguments parameters = parameters_of(a);
   const Results activated = activate(parameters);
   RasterizeArguments scene = scene_of(a, activated);
@@ -79,43 +216,51 @@ Results picture_gradients(PictureArguments a) {
     scene.scales = filtered[0].toTensor();
     scene.opacities = filtered[1].toTensor();
   }
-  const Results rendered = rasterize(scene);
-  const Tensor large = rendered[0].toTensor(), image = averaged(large, a.supersampling);
-  const Tensor shown = a.exposure ? correct_colors({image, *a.exposure})[0].toTensor() : image;
-  const L1SsimArguments comparison = comparison_of(a, shown);
-  const Results compared = l1_ssim(comparison);
-  Tensor loss = compared[0].toTensor();
-  if (parameters.has_penalty()) loss = loss.add(activated[3].toTensor());
-
-  Tensor dL_dimage =
-      gradients_of(l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}}))[0];
-  if (a.mask) dL_dimage = dL_dimage.mul(*a.mask);
-  Tensor dL_dexposure;
-  if (a.exposure) {
-    const std::vector<Tensor> of_correction =
-        gradients_of(correct_colors_vjp({{dL_dimage}, {image, *a.exposure}, {}, {true, true}}));
-    dL_dimage = of_correction[0];
-    dL_dexposure = of_correction[1];
-  }
-  dL_dimage = averaged_vjp(dL_dimage, large, a.supersampling);
-  std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
-  for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
-  needs[1] = a.mean_columns > 0;
-  const std::vector<Tensor> of_scene =
-      gradients_of(rasterize_vjp({{dL_dimage}, scene, rendered.back().toTensorVector(), needs}));
-  Tensor dL_dscales = of_scene[5], dL_dopacities = of_scene[2];
+  const auto rendering = render(scene);
+  Loss loss(a, rendering.image);
+  if (parameters.has_penalty()) loss.value = loss.value.add(activated[3].toTensor());
+  SceneGrads grads = rendering.vjp(loss.dL_drendered);
   if (a.filter_3d) {
     const std::vector<Tensor> of_filter =
-        gradients_of(apply_3d_filter_vjp({{dL_dscales, dL_dopacities}, unfiltered, {}, {true, true, false}}));
-    dL_dscales = of_filter[0];
-    dL_dopacities = of_filter[1];
+        gradients_of(apply_3d_filter_vjp({{grads.scales, grads.opacities}, unfiltered, {}, {true, true, false}}));
+    grads.scales = of_filter[0];
+    grads.opacities = of_filter[1];
   }
-  const std::vector<Tensor> of_parameters = gradients_of(
-      activate_vjp({{dL_dscales, of_scene[6], dL_dopacities, a.dL_dloss}, parameters, {}, {true, true, true}}));
-  std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
-  if (needs[1]) gradients.push_back(of_scene[1]);
-  if (a.exposure) gradients.push_back(dL_dexposure);
-  return {loss, shown, rendered[2], gradients};
+  const std::vector<Tensor> of_parameters = gradients_of(activate_vjp(
+      {{grads.scales, grads.rotations, grads.opacities, a.dL_dloss}, parameters, {}, {true, true, true}}));
+  std::vector<Tensor> gradients = {grads.means3D, of_parameters[0], of_parameters[1], of_parameters[2], grads.shs};
+  if (a.mean_columns > 0) gradients.push_back(grads.means2D);
+  if (a.exposure) gradients.push_back(loss.dL_dexposure);
+  return {loss.value, loss.shown, rendering.radii, gradients};
+}
+
+}  // namespace
+
+Results picture_gradients(PictureArguments a) {
+  check(a);
+  if (a.turn > 0) return gradients_through(a, [&](const RasterizeArguments& scene) { return Sphere(scene, a.turn); });
+  return gradients_through(a, [](const RasterizeArguments& scene) { return Rasterized(scene); });
+}
+
+Results rows_picture_gradients(RowsPictureArguments a) {
+  check(a);
+  BlendRowsArguments blended;
+  static_cast<ImageArguments&>(blended) = a;
+  blended.rows = a.rows;
+  blended.background = a.bg;
+  blended.keep = true;
+  const Results rendered = blend_rows(blended);
+  const Loss loss(a, rendered[0].toTensor());
+  BlendRowsVjpArguments back;
+  static_cast<ImageArguments&>(back) = a;
+  back.dL_dimage = loss.dL_drendered;
+  back.background = a.bg;
+  back.saved = rendered[2].toTensorVector();
+  const int64_t width = a.absolute ? kPackedGradWidthAbsolute : kPackedGradWidth, n = a.rows.size(0);
+  // In the place of splats, which are as wide at least.
+  static_cast<Tensor&>(back.dL_drows) = back.saved[0].view({-1}).narrow(0, 0, n * width).view({n, width});
+  blend_rows_vjp(back);
+  return {loss.value, loss.shown, back.dL_drows};
 }
 
 }  // namespace ar::ops

@@ -69,18 +69,32 @@ struct CorrectArguments {
   }
 };
 
-struct PictureArguments : CameraNumbers<double>, FootprintArguments {
+/// How a rendering becomes a loss.
+struct LossArguments {
+  Tensor target, dL_dloss;    ///< As of `l1_ssim`.
+  OptionalTensor exposure;    ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
+  OptionalTensor mask;        ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
+  double ssim_weight = 0;
+  int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("target", target);
+    visit("dL_dloss", dL_dloss);
+    visit("exposure", exposure);
+    visit("mask", mask);
+    visit("ssim_weight", ssim_weight);
+    visit("supersampling", supersampling);
+  }
+};
+
+struct PictureArguments : LossArguments, CameraNumbers<double>, FootprintArguments {
   Tensor means, log_scales, quats, logit_opacities, shs;
   int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.
-  Tensor target, dL_dloss;   ///< As of `l1_ssim`.
-  OptionalTensor exposure;   ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor mask;       ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
-  double ssim_weight = 0;
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
-  OptionalTensor filter_3d;   ///< (N,), that of `apply_3d_filter`.
-  int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
+  OptionalTensor filter_3d;  ///< (N,), that of `apply_3d_filter`.
   double opacity_weight = 0, scale_weight = 0;  ///< Of the mean opacity and scale, before the filter, in the loss.
+  double turn = 0;  ///< px of a turn in an equirectangular picture. Others have no seam: 0.
 
   template <class Visit> void each(Visit&& visit) {
     visit("means", means);
@@ -89,11 +103,7 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
     visit("logit_opacities", logit_opacities);
     visit("shs", shs);
     visit("mean_columns", mean_columns);
-    visit("target", target);
-    visit("dL_dloss", dL_dloss);
-    visit("exposure", exposure);
-    visit("mask", mask);
-    visit("ssim_weight", ssim_weight);
+    LossArguments::each(visit);
     visit("bg", bg);
     visit("viewmatrix", viewmatrix);
     visit("projmatrix", projmatrix);
@@ -102,9 +112,23 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
     each_number(visit);
     FootprintArguments::each(visit);
     visit("filter_3d=None", filter_3d);
-    visit("supersampling=1", supersampling);
     visit("opacity_weight=0.0", opacity_weight);
     visit("scale_weight=0.0", scale_weight);
+    visit("turn=0.0", turn);
+  }
+};
+
+/// Of the rows of all ranks, those of one camera.
+struct RowsPictureArguments : LossArguments, ImageArguments {
+  Tensor rows, bg;        ///< As of BlendRowsArguments.
+  bool absolute = false;  ///< Gradients of rows have sums of absolute values.
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("rows", rows);
+    LossArguments::each(visit);
+    visit("bg", bg);
+    ImageArguments::each(visit);
+    visit("absolute=False", absolute);
   }
 };
 

@@ -108,6 +108,28 @@ void check_weights(double opacity_weight, double scale_weight) {
                     "opacity_weight and scale_weight must be finite, got ", opacity_weight, " and ", scale_weight);
 }
 
+/// `like`: of the rendering, which has this size.
+void check_loss(const LossArguments& a, const Like& like, int64_t height, int64_t width) {
+  TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
+  like.check_type(a.dL_dloss, "dL_dloss");
+  check_shape(a.dL_dloss.dim() == 0, a.dL_dloss, "dL_dloss", "()");
+  check_target_type(a.target, like);
+  const int64_t times = a.supersampling;
+  TORCH_CHECK_VALUE(times >= 1 && height % times == 0 && width % times == 0,
+                    "supersampling must be at least 1 and divide image_height and image_width, ", height, " and ",
+                    width, ", got ", times);
+  const std::vector<int64_t> image = {3, height / times, width / times};
+  check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
+  if (a.exposure) {
+    like.check_type(*a.exposure, "exposure");
+    check_shape(a.exposure->sizes() == at::IntArrayRef({3, 4}), *a.exposure, "exposure", "(3, 4)");
+  }
+  if (!a.mask) return;
+  like.check_type(*a.mask, "mask");
+  const std::vector<int64_t> pixels = {image[1], image[2]};
+  check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
+}
+
 }  // namespace
 
 void check(SsimArguments& a) {
@@ -206,32 +228,20 @@ void check(CorrectArguments& a) {
 void check(PictureArguments& a) {
   TORCH_CHECK_VALUE(a.mean_columns == 0 || a.mean_columns == 3 || a.mean_columns == 4,
                     "mean_columns must be 0, 3 or 4, got ", a.mean_columns);
-  TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
   check_floating(a.means, "means");
   check_shape(a.means.dim() == 2 && a.means.size(1) == 3, a.means, "means", "(N, 3)");
   a.means = a.means.contiguous();
   const Like like{a.means, "means"};
   like.check_rows_of(a.log_scales, "log_scales", {3}, "(N, 3)");
-  like.check_type(a.dL_dloss, "dL_dloss");
-  check_shape(a.dL_dloss.dim() == 0, a.dL_dloss, "dL_dloss", "()");
-  check_target_type(a.target, like);
-  const int64_t times = a.supersampling;
-  TORCH_CHECK_VALUE(times >= 1 && a.image_height % times == 0 && a.image_width % times == 0,
-                    "supersampling must be at least 1 and divide image_height and image_width, ", a.image_height,
-                    " and ", a.image_width, ", got ", times);
-  const std::vector<int64_t> image = {3, a.image_height / times, a.image_width / times};
-  check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
-  if (a.exposure) {
-    like.check_type(*a.exposure, "exposure");
-    check_shape(a.exposure->sizes() == at::IntArrayRef({3, 4}), *a.exposure, "exposure", "(3, 4)");
-  }
-  if (a.mask) {
-    like.check_type(*a.mask, "mask");
-    const std::vector<int64_t> pixels = {image[1], image[2]};
-    check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
-  }
+  check_loss(a, like, a.image_height, a.image_width);
   like.check_rows_of(a.filter_3d, "filter_3d", {}, "(N,)");
   check_weights(a.opacity_weight, a.scale_weight);
+  TORCH_CHECK_VALUE(std::isfinite(a.turn) && a.turn >= 0, "turn must be finite and not negative, got ", a.turn);
+}
+
+void check(RowsPictureArguments& a) {
+  check_floating(a.rows, "rows");
+  check_loss(a, {a.rows, "rows"}, a.image_height, a.image_width);
 }
 
 void check(AdamArguments& a) {
