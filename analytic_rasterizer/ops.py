@@ -231,7 +231,18 @@ def _(a):
 def _(a):
     context = torch.library.get_ctx()
     rows = context.new_dynamic_size()
-    names = ("means2d", "cov2d", "opacities", "depths", "colors", "beside", "radii", "gaussian_ids", "camera_ids", "dets")
+    names = (
+        "means2d",
+        "cov2d",
+        "opacities",
+        "depths",
+        "colors",
+        "beside",
+        "radii",
+        "gaussian_ids",
+        "camera_ids",
+        "dets",
+    )
     given = [getattr(a, name) for name in names]
     made = [a.means2d.new_empty(0) if t is None else t.new_empty(rows, *t.shape[1:]) for t in given]
     if a.colors.shape[0] == 0:

@@ -122,7 +122,7 @@ def rasterize(
         RuntimeError: Another error on some rank, up to the message with the counts; later ones end in the time-out of
             the group.
     """
-    rank, world = place_in(group)
+    _, world = place_in(group)
     means3D, opacities = widened(means3D), widened(opacities)
     gaussians = {
         "shs": widened(shs),
@@ -134,9 +134,31 @@ def rasterize(
     if world == 1:
         cameras, _ = _checked_cameras(settings, owners, world, shs, colors_precomp)
         return _of_one_rank(cameras, means3D, opacities, means2d_abs, gaussians)
+    step, count = agreed_step(settings, means3D, opacities, gaussians, owners, means2d_abs, group)
+    anchor, images, alphas = rendered(step)
+    shard, received = step.take()
+    renderings = tuple(Rendering(*of_camera) for of_camera in zip(step.route.own, images, alphas, received))
+    return Batch(renderings, shard, step.means2d_abs, step.first_id, count, anchor)
+
+
+def agreed_step(
+    settings: Sequence[GaussianRasterizationSettings],
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    gaussians: dict[str, Any],
+    owners: Sequence[int] | None = None,
+    means2d_abs: bool = False,
+    group: dist.ProcessGroup | None = None,
+) -> tuple[Step, int]:
+    """The step that all ranks, of which there are several, have agreed on, and the number of their Gaussians.
+
+    Args and errors: As of `rasterize`.
+    """
+    rank, world = place_in(group)
 
     def make() -> tuple[tuple, Facts, torch.Tensor]:
-        cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
+        shs, colors = gaussians["shs"], gaussians["colors_precomp"]
+        cameras, settled = _checked_cameras(settings, owners, world, shs, colors)
         groups = together(cameras, means3D, opacities, **gaussians)
         cameras_of = [[c for c, owner in enumerate(settled) if owner == r] for r in range(world)]
         own = Shard(groups, [c for of_rank in cameras_of for c in of_rank])  # the device counts meanwhile
@@ -150,12 +172,7 @@ def rasterize(
     (cameras, cameras_of, own), agreed = agree(make, _REQUIREMENTS, group, meanwhile=lambda made: made[-1].begin())
     first_id, count, join = summary_of(agreed.facts, rank)
     route = Route(agreed.counts, cameras_of, rank, group)
-    backgrounds = [cameras[c].bg for c in route.own]
-    step = Step(own, route, first_id, join, means2d_abs, backgrounds)
-    anchor, images, alphas = rendered(step)
-    shard, received = step.take()
-    renderings = tuple(Rendering(*of_camera) for of_camera in zip(route.own, images, alphas, received))
-    return Batch(renderings, shard, step.means2d_abs, first_id, count, anchor)
+    return Step(own, route, first_id, join, means2d_abs, [cameras[c].bg for c in route.own]), count
 
 
 def _of_one_rank(

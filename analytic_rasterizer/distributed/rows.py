@@ -210,14 +210,17 @@ class Step:
         counts = self.route.counts[self.route.rank]
         return {"firsts": [self._sent[c].start for c in group.cameras], "counts": [counts[c] for c in group.cameras]}
 
-    def run(self) -> tuple[torch.Tensor, ...]:
-        """Images (3, H, W) of this rank's cameras, and then their alphas (1, H, W)."""
+    def exchange(self) -> list[tuple[torch.Tensor, torch.Tensor, dict[str, Any]]]:
+        """Of this rank's cameras the rows of all ranks, the background, and size and footprint by names of the ops."""
         sent = self._rows_of_shard()
         rows = self.route.by_camera(self.route.send(sent, True))
-        del sent  # before the memory is needed
+        images = [self._images[camera] for camera in self.route.own]
+        return list(zip(rows.split(self.route.sizes), self.backgrounds, images))
+
+    def run(self) -> tuple[torch.Tensor, ...]:
+        """Images (3, H, W) of this rank's cameras, and then their alphas (1, H, W)."""
         images, alphas, received = [], [], []
-        for camera, of_camera, background in zip(self.route.own, rows.split(self.route.sizes), self.backgrounds):
-            image = self._images[camera]
+        for of_camera, background, image in self.exchange():
             color, alpha, saved = _OPS.blend_rows(of_camera, background.detach(), **image, keep=self.join)
             images.append(color)
             alphas.append(alpha[None])
@@ -269,23 +272,56 @@ class Step:
             of_backgrounds.append(of_bg if needs[k] else None)
             by_camera.append(rows)
             del saved, rows
-        like = self.groups[0].gaussians["means3D"]
-        sent = self.route.by_rank(by_camera) if by_camera else like.new_empty(0, width)
-        by_camera.clear()
-        own = self.route.send(sent, False)
-        del sent
+        own = self.exchange_back(by_camera)
         self._give(own)
         found, step = [], len(_TENSORS) + len(_CAMERA_TENSORS)
         for k, group in enumerate(self.groups):
             part = slice(step * k, step * (k + 1))
-            needed = needs[len(self.backgrounds) :][part]
-            if not any(needed):
-                found += [None] * step
-                continue
-            arguments = group.arguments(tensors[part])
-            made = _OPS.pack_rows_vjp(own, **arguments, ids=self._ids, **self.places(group), needs=needed)
-            found += [t.view_as(tensor) if need else None for t, tensor, need in zip(made, tensors[part], needed)]
+            found += self._gradients_of(group, own, tensors[part], needs[len(self.backgrounds) :][part])
         return [*of_backgrounds, *found]
+
+    def exchange_back(self, by_camera: list[torch.Tensor]) -> torch.Tensor:
+        """Gradients with respect to the rows of this rank's Gaussians.
+
+        Args:
+            by_camera: Those with respect to the rows of this rank's cameras. The list is emptied.
+        """
+        like, width = self.groups[0].gaussians["means3D"], _C.ROW_GRAD_WIDTHS[int(self.absolute)]
+        sent = self.route.by_rank(by_camera) if by_camera else like.new_empty(0, width)
+        by_camera.clear()
+        return self.route.send(sent, False)
+
+    def _gradients_of(
+        self, group: Together, own: torch.Tensor, tensors: Sequence[torch.Tensor | None], needs: Sequence[bool]
+    ) -> list[torch.Tensor | None]:
+        """Gradients with respect to the tensors of some cameras, from those with respect to their rows."""
+        if not any(needs):
+            return [None] * len(needs)
+        arguments = group.arguments(tensors)
+        made = _OPS.pack_rows_vjp(own, **arguments, ids=self._ids, **self.places(group), needs=needs)
+        return [t.view_as(tensor) if need else None for t, tensor, need in zip(made, tensors, needs)]
+
+    def gradients(self, own: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Gradients with respect to the Gaussians of this rank, of all that are given, by the names of the ops.
+
+        Args:
+            own: What `exchange_back` returned.
+        """
+        total: dict[str, torch.Tensor] = {}
+        for group in self.groups:
+            needs = [
+                name in _TENSORS and t is not None for name, t in zip((*_TENSORS, *_CAMERA_TENSORS), group.tensors)
+            ]
+            made = self._gradients_of(group, own, group.tensors, needs)
+            for name, gradient in zip(_TENSORS, made):
+                if gradient is not None:
+                    total[name] = total[name] + gradient if name in total else gradient
+        return total
+
+    def means_gradients(self, own: torch.Tensor) -> list[torch.Tensor]:
+        """Of every camera (n, 2), per px: dL/dmeans2d of this rank's splats; with `absolute`, sums over pixels."""
+        columns = _C.ROW_GRAD_COLUMNS["means2d_abs" if self.absolute else "means2d"]
+        return [own[part, columns] for part in self._sent]
 
     def _give(self, own: torch.Tensor) -> None:
         """Gives what the batch holds its gradients, from those with respect to the rows of this rank's Gaussians."""

@@ -18,14 +18,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import _C
 from ..distributed import OwnSplats
+from ..distributed.cameras import agreed_step
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
-from ..losses import l1_ssim
 from ..optim import MOMENTS
 from .extent import extent_of
-from .model import filtered, render_together
+from .model import enlarged
 from .trainer import Trainer
+
+_OPS = torch.ops.analytic_rasterizer
+_activate, _apply_3d_filter, _rows_picture_gradients = map(
+    _C.Call, ("activate", "apply_3d_filter", "rows_picture_gradients")
+)
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
 UNEVEN = 1.1  # the largest shard, in means of all, above which Gaussians move to other ranks
@@ -35,8 +41,41 @@ class Seen(NamedTuple):
     """A picture of a step that density control looks at, and where its gradients are."""
 
     ids: Tensor  # (n,) int32, the Gaussians of this rank that it shows
-    means2d: Tensor  # (n, 2) whose grad is with respect to their projected means, px, or sums of absolute values
+    gradient: Tensor  # (n, 2) with respect to their projected means, per px, or sums of absolute values
     size: tuple[int, int]  # width and height of the rendering, px
+
+
+class Shapes:
+    """The activations of this rank's Gaussians, with the 3D filter, and the way back to the parameters.
+
+    Attributes:
+        arguments: Scales (N, 3) and rotations (N, 4), by the names of the ops.
+        opacities: (N, 1).
+        penalty: () float32, this rank's part of the regularizers; None: there are none.
+    """
+
+    def __init__(self, gaussians: Gaussians, filter_3d: Tensor | None, regularizers: tuple[float, float], count: int):
+        self._gaussians, self._filter_3d = gaussians, filter_3d
+        opacity_weight, scale_weight = regularizers
+        self._weights = opacity_weight / count, scale_weight / (3 * count)
+        scales, rotations, opacities, penalty = _activate(*gaussians[1:4], *self._weights)
+        self._unfiltered = scales, opacities
+        if filter_3d is not None:
+            scales, opacities = _apply_3d_filter(scales, opacities, filter_3d)
+        self.arguments, self.opacities = {"scales": scales, "rotations": rotations}, opacities
+        self.penalty = penalty if any(self._weights) else None
+
+    def differentiate(self, gradients: dict[str, Tensor]) -> None:
+        """Gives the parameters their gradients, from those of what was rendered, by the names of the ops."""
+        scales, opacities = gradients["scales"], gradients["opacities"]
+        if self._filter_3d is not None:
+            scales, opacities, _ = _OPS.apply_3d_filter_vjp(
+                [scales, opacities], *self._unfiltered, self._filter_3d, [], [True, True, False]
+            )
+        given = [scales, gradients["rotations"], opacities, None if self.penalty is None else scales.new_ones(())]
+        made = _OPS.activate_vjp(given, *self._gaussians[1:4], *self._weights, [], [True] * 3)
+        for field, gradient in zip(self._gaussians, (gradients["means3D"], *made, gradients["shs"])):
+            field.grad = gradient
 
 
 class ShardedTrainer(Trainer):
@@ -86,50 +125,60 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    @torch.enable_grad()  # whatever the caller has switched off
+    @torch.no_grad()
     def _differentiate(self) -> tuple[Tensor, Tensor | None]:
-        """As of `Trainer`, by autograd, which sends gradients to the ranks that they belong to."""
-        loss, seen, rows = self._loss()
-        with torch.autograd.set_multithreading_enabled(False):  # as in gradients_by_autograd
-            loss.backward()
+        """As of `Trainer`; gradients go to the ranks that they belong to. The loss is this rank's part."""
+        loss, seen, rows = self._differentiate_together()
         self._observe(seen)
-        return loss.detach(), rows
+        return loss, rows
 
-    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None]:
+    def _differentiate_together(self) -> tuple[Tensor, list[Seen], Tensor | None]:
         """This rank's part of the loss, whose sum over the ranks is the loss of the step; what `_observe` takes; and
         with `sparse_adam` the rows that the optimizer updates.
 
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
         """
         options, shown = self.options, self._next()
-        gaussians = self.gaussians.arguments()
-        batch = render_together(
-            filtered(gaussians, self.filter_3d),
-            [picture.settings for picture in shown],
-            options.supersampling,
+        shapes = Shapes(self.gaussians, self.filter_3d, options.regularizers, self.count)
+        step, _ = agreed_step(
+            [enlarged(picture.settings, options.supersampling) for picture in shown],
+            self.gaussians.means,
+            shapes.opacities,
+            {"shs": self.gaussians.shs, "colors_precomp": None, "cov3D_precomp": None, **shapes.arguments},
             means2d_abs=options.density == "absgrad",
             group=self.ranks.group,
         )
-        loss = batch.anchor
-        for rendering in batch.renderings:
-            picture = shown[rendering.camera]
+        by_camera, losses = [], [] if shapes.penalty is None else [shapes.penalty]
+        for camera, (rows, background, image) in zip(step.route.own, step.exchange()):
+            picture = shown[camera]
             truth = self.pictures.target(picture.scale, picture.view, picture.background)
             mask = self.pictures.mask(picture.scale, picture.view)
-            loss = loss + l1_ssim(rendering.image, truth, options.ssim_weight, mask) / len(shown)
-            self._last = rendering.image.detach(), truth, mask
-        opacity_weight, scale_weight = options.regularizers
-        if opacity_weight:
-            loss = loss + opacity_weight * gaussians["opacities"].sum() / batch.count
-        if scale_weight:
-            loss = loss + scale_weight * gaussians["scales"].sum() / (3 * batch.count)
-        rows = self._visible(batch.shard) if options.sparse_adam else None
-        # What else there is of the batch is let go of, before the backward pass needs the memory.
-        seen = []
-        for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
-            if self._watches(picture.scale):
-                leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
-                seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
-        return loss, seen, rows
+            loss, drawn, dL_drows = _rows_picture_gradients(
+                rows=rows,
+                target=truth,
+                dL_dloss=self.dL_dloss / self.stride,
+                exposure=None,
+                mask=mask,
+                ssim_weight=options.ssim_weight,
+                supersampling=options.supersampling,
+                bg=background,
+                absolute=step.absolute,
+                **image,
+            )
+            by_camera.append(dL_drows)
+            losses.append(loss / len(shown))
+            self._last = drawn, truth, mask
+        own = step.exchange_back(by_camera)
+        shapes.differentiate(step.gradients(own))
+        splats = step.own
+        visible = self._visible(splats) if options.sparse_adam else None
+        seen = [
+            Seen(of_camera.gaussian_ids, gradient, (of_camera.width, of_camera.height))
+            for picture, of_camera, gradient in zip(shown, splats, step.means_gradients(own))
+            if self._watches(picture.scale)
+        ]
+        nothing = torch.zeros((), dtype=torch.float32, device=self.device)
+        return torch.stack(losses).sum() if losses else nothing, seen, visible
 
     def _visible(self, shard: Sequence[OwnSplats]) -> Tensor:
         """Which Gaussians of this rank at least one of the pictures shows, (P,) bool. Waits for no device."""
@@ -141,12 +190,12 @@ class ShardedTrainer(Trainer):
 
     def _observe(self, seen: list[Seen]) -> None:
         """Density control sees the gradients that each picture would have in one process."""
-        for ids, leaf, size in seen:
+        for ids, gradient, size in seen:
             if len(ids) == 0:
                 continue
             # From px to normalized device coordinates, and from the mean over all ranks' pictures to that over one's.
             # Column by column: a tensor of two numbers from the host would wait for the device.
-            columns = [leaf.grad[:, k] * (size[k] / 2 * self.stride) for k in range(2)]
+            columns = [gradient[:, k] * (size[k] / 2 * self.stride) for k in range(2)]
             self.density.observe_rows(ids.long(), torch.stack(columns, 1))
 
     def _rebalance(self) -> None:
@@ -175,11 +224,11 @@ class ShardedTrainer(Trainer):
         self.density.gaussians = new
         self.density.forget()
 
-    @torch.enable_grad()
+    @torch.no_grad()
     def warm_up(self) -> None:
         """Renders and differentiates the pictures of the first step without taking it."""
         state = self.generator.get_state()
-        self._loss()[0].backward()
+        self._differentiate_together()
         self.generator.set_state(state)
         self.optimizer.zero_grad(set_to_none=True)
 

@@ -18,13 +18,13 @@ from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
 from ..losses import counted
 from ..render.arguments import camera_arguments
-from ..render.seam import has_seam
+from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .exposure import Exposures
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
-from .model import enlarged, gradients_by_autograd
+from .model import enlarged
 from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
@@ -289,10 +289,7 @@ class Trainer:
             "opacity_weight": opacity_weight,
             "scale_weight": scale_weight,
         }
-        if has_seam(shown.settings):
-            made = gradients_by_autograd(self.gaussians, shown.settings, **given)
-        else:
-            made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **self._camera(shown))
+        made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **self._camera(shown))
         loss, image, radii, gradients = made
         self._last = image, truth, mask
         return loss, radii, gradients
@@ -302,7 +299,7 @@ class Trainer:
         camera = self._cameras.get((shown.scale, shown.view))
         if camera is None:
             larger = enlarged(shown.settings, self.options.supersampling)
-            camera = camera_arguments(larger, self.gaussians.means, None)
+            camera = camera_arguments(larger, self.gaussians.means, None, with_seam=True) | {"turn": turn_of(larger)}
             self._cameras[shown.scale, shown.view] = camera
         return camera
 

@@ -931,6 +931,9 @@ def _calls(footprint, options, device, full):
         bent = ar.Effects(lens=ar.Lens("perspective", torch.zeros(12, device=device).requires_grad_()))
         bent_settings = CAMERA.settings(torch.float32, device, footprint="point", effects=bent)
         ar.GaussianRasterizer(bent_settings)(means2D=None, **leaves)[0].sum().backward()
+        around = ar.Effects(lens=ar.Lens.equirectangular())
+        around_settings = CAMERA.settings(torch.float32, device, footprint=footprint, effects=around, **dict(options))
+        ar.GaussianRasterizer(around_settings)(means2D=None, **leaves)[0].sum().backward()
         pose = torch.eye(4, device=device).requires_grad_()
         ar.camera_settings(pose, 8, 6, 9.0, 9.0).projmatrix.sum().backward()
         offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
@@ -941,12 +944,20 @@ def _calls(footprint, options, device, full):
 OPS = {
     *("rasterize", "rasterize_timed", "rasterize_vjp", "project", "project_vjp", "bin", "blend", "blend_vjp"),
     *(f"prepare_{what}{suffix}" for what in ("cameras", "lens") for suffix in ("", "_vjp")),
-    *("composite", "composite_vjp", "inspect", "footprint_weight", "footprint_weight_vjp"),
+    *(
+        "repeat_at_seam",
+        "repeat_at_seam_vjp",
+        "composite",
+        "composite_vjp",
+        "inspect",
+        "footprint_weight",
+        "footprint_weight_vjp",
+    ),
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, ..., test_distributed.py
     *("ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"),
     *("ssim_map_vjp", "l1_ssim_vjp", "activate_vjp", "apply_3d_filter_vjp", "correct_colors_vjp"),
-    *("adam_", "observe_", "add_noise_", "picture_gradients"),
+    *("adam_", "observe_", "add_noise_", "picture_gradients", "rows_picture_gradients"),
     *("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_"),
 }
 

@@ -468,6 +468,31 @@ def test_stages_and_features_show_the_seam_too():
     torch.testing.assert_close(color[3:], first[:2])
 
 
+def test_copies_at_the_seam_have_the_gradients_of_differences():
+    """Of splats that do not overlap themselves, that do, and that are wider than the turn; one camera has no seam."""
+    generator = torch.Generator().manual_seed(0)
+    width, deviations = 24, torch.tensor([0.5, 2, 4, 8, 12, 16, 17, 19, 25, 40, 3], dtype=torch.float64)
+    n = len(deviations)
+    means2d = 30 * torch.rand(n, 2, generator=generator, dtype=torch.float64) - 3
+    cov2d = torch.stack([deviations**2, 0.3 * deviations, torch.full_like(deviations, 2.0)], 1)
+    opacities = torch.linspace(0.1, 0.95, n, dtype=torch.float64)
+    depths, colors, beside = (torch.rand(n, *k, generator=generator, dtype=torch.float64) for k in ((), (3,), (2,)))
+    turns = torch.tensor([float(width), math.inf], dtype=torch.float64)
+    splits, ints = torch.tensor([0, 8, n]), torch.arange(n, dtype=torch.int32)
+    cameras = (ints >= 8).int()
+
+    def repeated(*tensors):
+        image = (12, width, "point", 0.3)
+        *made, saved = torch.ops.analytic_rasterizer.repeat_at_seam(
+            *tensors, ints + 1, ints, cameras, tensors[1][:, 2].detach(), splits, *image
+        )
+        assert torch.equal(made[6] - 1, made[7]) and made[10][-1] == len(made[0]) > n and not saved[0].requires_grad
+        return made[:6]
+
+    given = [t.requires_grad_() for t in (means2d, cov2d, opacities, depths, colors, turns, beside)]
+    assert torch.autograd.gradcheck(repeated, given)
+
+
 def test_directions_of_pixels_of_the_sphere():
     view = ar.View("v", 64, 32, 64 / (2 * math.pi), 32 / math.pi, torch.eye(4, dtype=torch.float64), lens=SPHERE)
     points = torch.nn.functional.normalize(

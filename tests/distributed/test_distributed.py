@@ -23,6 +23,7 @@ from analytic_rasterizer.cli import launch
 from analytic_rasterizer.distributed import agreement
 from analytic_rasterizer.distributed.exchange import Route
 from analytic_rasterizer.distributed.rows import Shard, together
+from analytic_rasterizer.losses import l1_ssim
 
 WORLD = 3
 COUNT, HIDDEN = 60, slice(37, 46)
@@ -627,7 +628,7 @@ def test_the_way_back_is_taken_once(runs):
         assert kind == "RuntimeError" and "runs once" in message
 
 
-OPS = ("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_")
+OPS = ("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_", "rows_picture_gradients")
 
 
 def calls_of(device, camera=0):
@@ -663,7 +664,10 @@ def calls_of(device, camera=0):
     dL_drows = torch.cat([back["dL_drows"]] * 2)
     needs = [name in ("means3D", "opacities", "shs", "scales", "rotations") for name in arguments][:11]
     adjoint = arguments | {"dL_drows": dL_drows, "ids": ids, "needs": needs} | places
-    return dict(zip(OPS, (arguments, packed, adjoint, blended, back)))
+    target = torch.rand(color.shape, generator=torch.Generator().manual_seed(0), dtype=color.dtype).to(device)
+    loss = {"target": target, "dL_dloss": target.new_tensor(0.5), "ssim_weight": 0.2, "supersampling": 1}
+    picture = {"rows": rows[:n], "exposure": None, "mask": None, "bg": background, "absolute": True} | loss | image
+    return dict(zip(OPS, (arguments, packed, adjoint, blended, back, picture)))
 
 
 @pytest.fixture
@@ -688,6 +692,21 @@ def test_gradients_of_rows_are_those_of_blend(camera, device):
     different = (rows != torch.cat(made, 1)).nonzero().tolist()
     assert not different, (different, (rows - torch.cat(made, 1)).abs().max())
     assert all(leaf.grad.any() for leaf in leaves.values())
+
+
+def test_a_picture_of_rows_has_the_gradients_of_autograd(calls):
+    given, back = calls["rows_picture_gradients"], calls["blend_rows_vjp_"]
+    image, _, saved = torch.ops.analytic_rasterizer.blend_rows(**calls["blend_rows"])
+    image.requires_grad_()
+    expected = l1_ssim(image, given["target"], given["ssim_weight"])
+    (dL_dimage,) = torch.autograd.grad(expected, image, given["dL_dloss"])
+    rows = torch.zeros_like(back["dL_drows"])
+    torch.ops.analytic_rasterizer.blend_rows_vjp_(
+        **back | {"dL_drows": rows, "dL_dimage": dL_dimage, "dL_dalpha": None, "saved": saved}
+    )
+    loss, shown, dL_drows = torch.ops.analytic_rasterizer.rows_picture_gradients(**given)
+    assert torch.equal(loss, expected.detach()) and torch.equal(shown, image.detach())
+    assert rows.any() and torch.equal(dL_drows, rows)
 
 
 def test_rows_hold_what_project_returns(calls, device):

@@ -21,13 +21,14 @@ from processes import DEADLINE, in_threads, python_path, run_program, start_proc
 from runs import TINY, rows_shown, scatter
 from torch.distributed import distributed_c10d
 
-from analytic_rasterizer import training
+from analytic_rasterizer import distributed, training
 from analytic_rasterizer.cli import launch
 from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts
 from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.losses import l1_ssim
 from analytic_rasterizer.optim import MOMENTS, FusedAdam
 from analytic_rasterizer.training import TrainingOptions, files, model, schedule
-from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer
+from analytic_rasterizer.training.sharded import UNEVEN, Seen, ShardedTrainer
 
 WORLD = 3
 STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and from 1 to 3
@@ -131,8 +132,8 @@ def gradients(scene, folder, ranks):
     run = make_run(scene, folder / "gradients", ranks)
     trainer = run.trainer
     trainer._set_rates()
-    loss, seen, *_ = trainer._loss()
-    loss.backward()
+    with torch.no_grad():
+        loss, seen, _ = trainer._differentiate_together()
     made = {name: ranks.gather_rows(field.grad) for name, field in trainer.gaussians._asdict().items()}
     trainer._observe(seen)
     made["sums"] = ranks.gather_rows(trainer.density.gradient_sums)
@@ -289,8 +290,7 @@ def test_gradients_are_those_of_one_process(made):
     """A sum over two cameras has one rounding, whatever its order; the rest is the same arithmetic."""
     got = torch.load(made / "gradients.pt")
     one = sharded_alone(made)
-    loss, seen, *_ = one._loss()
-    loss.backward()
+    loss, seen, _ = differentiate_alone(one)
     # A rounding for each part of the sum, and one for each part's division.
     assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
     for name, field in one.gaussians._asdict().items():
@@ -313,6 +313,22 @@ def sharded_alone(made, **more):
     return one
 
 
+def differentiate_alone(one):
+    """What `_differentiate_together` returns, by autograd in one process."""
+    pictures, gaussians = one._next(), one.gaussians.arguments()
+    batch = distributed.rasterize([p.settings for p in pictures], **gaussians, means2d_abs=True)
+    losses = []
+    for shown, of_camera in zip(pictures, batch.renderings, strict=True):
+        losses.append(l1_ssim(of_camera.image, one.pictures.target(*shown[:2], None), one.options.ssim_weight))
+    loss = sum(of_picture / len(losses) for of_picture in losses)
+    loss.backward()
+    seen = []
+    for splats, absolute in zip(batch.shard, batch.means2d_abs):
+        gradient = absolute.grad if one.options.density == "absgrad" else splats.means2d.grad
+        seen.append(Seen(splats.gaussian_ids, gradient, (splats.width, splats.height)))
+    return loss.detach(), seen, one._visible(batch.shard)
+
+
 def optimizer_of_two(one):
     """An optimizer of its Gaussians with the rates of two ranks."""
     rates = [2**0.5 * group["lr"] for group in one.optimizer.param_groups]
@@ -325,9 +341,8 @@ def test_a_sparse_step_updates_what_a_picture_of_any_rank_shows(made):
     one = sharded_alone(made, sparse_adam=True)
     scatter(one.gaussians)
     shown, optimizer = rows_shown(one), optimizer_of_two(one)
-    loss, _, rows = one._loss()
+    _, _, rows = differentiate_alone(one)
     assert torch.equal(rows, shown[0] | shown[1]) and not torch.equal(*shown) and 0 < rows.sum() < len(rows)
-    loss.backward()
     optimizer.step(rows=rows)
     expected = [*one.gaussians, *(optimizer.state[field][moment] for field in one.gaussians for moment in MOMENTS)]
     for field, after in zip(expected, torch.load(made / "sparse-step.pt"), strict=True):

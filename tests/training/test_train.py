@@ -22,6 +22,7 @@ from runs import TINY, rows_shown, scatter
 from train_extra import image
 from training_step import TOLERANCE, check_next_step
 
+import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, optim, training
 from analytic_rasterizer.cameras.lens import Lens
 from analytic_rasterizer.filters import bake_pixel
@@ -29,6 +30,7 @@ from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.render.arguments import camera_arguments
+from analytic_rasterizer.render.seam import turn_of
 from analytic_rasterizer.training import TrainingOptions, captures, files, pictures, schedule
 from analytic_rasterizer.training import model as g
 from analytic_rasterizer.training.evaluation import evaluate, psnr
@@ -451,6 +453,13 @@ FIELDS = ("means", "log_scales", "quats", "logit_opacities", "shs")
 PARTS = ("", "mask", "exposure", "filter", "supersampling", "regularizers", "all")
 
 
+def settings_of(lens, device, dtype=torch.float32):
+    view = circle(1)[0]
+    if lens is SPHERE:
+        view = replace(view, lens=lens, fx=view.width / (2 * math.pi), fy=view.height / math.pi)
+    return replace(view, lens=lens).settings(sh_degree=0, footprint="box:samples=4", device=device, dtype=dtype)
+
+
 def picture_arguments(device, parts="", lens=None, dtype=torch.float32, **changed):
     """Of the op `picture_gradients`, with some of `PARTS`."""
     view, generator = replace(circle(1)[0], lens=lens), torch.Generator().manual_seed(1)
@@ -462,33 +471,50 @@ def picture_arguments(device, parts="", lens=None, dtype=torch.float32, **change
         "mask": {"mask": torch.rand(size, generator=generator)},
         "exposure": {"exposure": torch.eye(3, 4) + 0.1 * torch.rand(3, 4, generator=generator)},
         "filter": {"filter_3d": 0.3 * torch.rand(len(log_scales), generator=generator)},
-        "supersampling": {"supersampling": times},
         "regularizers": {"opacity_weight": 0.3, "scale_weight": 0.2},
     }
     given = dict(zip(FIELDS, gaussians._replace(log_scales=log_scales)))
     given |= {"dL_dloss": torch.tensor(0.75), "bg": torch.full((3,), 0.2), "exposure": None, "mask": None}
+    given |= {"supersampling": times}
     for name, more in of_parts.items():
         given |= more if parts in (name, "all") else {}
     moved = {name: v.to(device, dtype) if isinstance(v, torch.Tensor) else v for name, v in given.items()}
     target = torch.rand(3, *size, generator=generator).mul(255).byte().to(device)
-    settings = view.settings(sh_degree=0, footprint="box:samples=4", device=device, dtype=dtype)
-    camera = camera_arguments(settings, moved["means"], None)
+    settings = settings_of(lens, device, dtype)
+    camera = camera_arguments(settings, moved["means"], None, with_seam=True) | {"turn": turn_of(settings)}
     return moved | {"mean_columns": 4, "target": target, "ssim_weight": 0.2} | camera | changed
 
 
-@pytest.mark.parametrize("parts", PARTS)
-def test_gradients_by_autograd_are_those_of_the_op(device, parts):
-    """So those of a sphere, which only autograd has, are right."""
-    arguments = picture_arguments(device, parts)
-    loss, picture, radii, gradients = torch.ops.analytic_rasterizer.picture_gradients(**arguments)
-    gaussians, times = Gaussians(*(arguments.pop(name) for name in FIELDS)), arguments.get("supersampling", 1)
-    settings = circle(1)[0].settings(sh_degree=0, footprint="box:samples=4", device=device)
-    given = {k: v for k, v in arguments.items() if k not in camera_arguments(settings, gaussians.means, None)}
-    settings = settings._replace(image_height=32 // times, image_width=32 // times, bg=given.pop("bg"))
-    of_autograd = g.gradients_by_autograd(gaussians, settings, **given)
-    assert torch.equal(picture, of_autograd[1]) and torch.equal(radii, of_autograd[2])
-    for found, expected in zip((*gradients, loss), (*of_autograd[3], of_autograd[0]), strict=True):
-        assert expected.norm() > 0 and (found - expected).norm() <= TOLERANCE * expected.norm()
+SPHERE = Lens.equirectangular()
+
+
+@pytest.mark.parametrize("lens", [None, SPHERE], ids=["pinhole", "sphere"])
+@pytest.mark.parametrize("parts, columns", [*((parts, 4) for parts in PARTS), ("", 0), ("all", 0), ("all", 3)])
+def test_gradients_of_a_picture_are_those_of_autograd(device, lens, parts, columns):
+    given = picture_arguments(device, parts, lens, mean_columns=columns)
+    loss, picture, radii, gradients = torch.ops.analytic_rasterizer.picture_gradients(**given)
+    times, weights = given["supersampling"], (given.get("opacity_weight", 0), given.get("scale_weight", 0))
+    parameters = Gaussians(*(given[name] for name in FIELDS)).map(lambda field: field.clone().requires_grad_())
+    means2D = torch.zeros(len(radii), max(columns, 3), device=device, requires_grad=True)
+    arguments, shown = parameters.arguments(), parameters.arguments()
+    if "filter_3d" in given:
+        widened = ar.apply_3d_filter(shown["scales"], shown["opacities"], given["filter_3d"])
+        shown |= dict(zip(("scales", "opacities"), widened))
+    settings = settings_of(lens, device)._replace(bg=given["bg"])
+    image, expected_radii = ar.GaussianRasterizer(settings)(means2D=means2D, **shown)
+    image = torch.nn.functional.avg_pool2d(image, times)
+    exposure = given["exposure"]
+    if exposure is not None:
+        exposure = exposure.clone().requires_grad_()
+        image = torch.einsum("ij,jhw->ihw", exposure[:, :3], image) + exposure[:, 3, None, None]
+    expected = l1_ssim(image, given["target"], given["ssim_weight"], given["mask"])
+    expected = expected + weights[0] * arguments["opacities"].mean() + weights[1] * arguments["scales"].mean()
+    wanted = [*parameters, *([means2D] if columns else []), *([] if exposure is None else [exposure])]
+    made = torch.autograd.grad(expected, wanted, given["dL_dloss"])
+    torch.testing.assert_close(picture, image.detach(), rtol=0, atol=1e-6)
+    assert torch.equal(radii, expected_radii)
+    for found, of_autograd in zip((*gradients, loss), (*made, expected), strict=True):
+        assert of_autograd.norm() > 0 and (found - of_autograd).norm() <= TOLERANCE * of_autograd.norm()
 
 
 @pytest.mark.parametrize("options", [{}, {"density": "mcmc"}, {"background": "random", "filter_3d": True}], ids=str)
