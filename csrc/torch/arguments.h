@@ -283,8 +283,8 @@ struct CompositeArguments : ImageArguments {
 /// Rows of which those of pictures with a seam are repeated.
 struct SeamArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, depths, colors;  ///< Colours (N, 3), or (0, 3).
-  Tensor turns;           ///< (C,) px of a turn of each camera, infinite without a seam.
-  OptionalTensor beside;  ///< (N, K), repeated too.
+  Tensor turns;                                      ///< (C,) px of a turn of each camera, infinite without a seam.
+  OptionalTensor beside;                             ///< (N, K), repeated too.
   Tensor radii, gaussian_ids, camera_ids, dets, row_splits;
   bool keep = false;
 

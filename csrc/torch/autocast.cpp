@@ -25,9 +25,9 @@ template <c10::DispatchKey kAutocast> void in_float32(const c10::OperatorHandle&
 
 /// The ops that write to no argument. Adjoints get arguments that have been cast.
 template <c10::DispatchKey kAutocast> void register_casts(torch::Library& m) {
-  for (const char* name :
-       {"prepare_cameras", "prepare_lens", "rasterize", "rasterize_timed", "project", "repeat_at_seam", "composite", "count_rows", "bin",
-        "blend", "inspect", "footprint_weight", "ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"})
+  for (const char* name : {"prepare_cameras", "prepare_lens", "rasterize", "rasterize_timed", "project",
+                           "repeat_at_seam", "composite", "count_rows", "bin", "blend", "inspect", "footprint_weight",
+                           "ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"})
     m.impl(name, torch::CppFunction::makeFromBoxedFunction<&in_float32<kAutocast>>());
 }
 

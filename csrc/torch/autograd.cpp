@@ -210,14 +210,21 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
 }
 
 TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {
-  for (const char* name : {"prepare_cameras", "prepare_lens", "rasterize", "project", "repeat_at_seam", "composite", "blend",
-                           "footprint_weight", "ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"})
+  for (const char* name :
+       {"prepare_cameras", "prepare_lens", "rasterize", "project", "repeat_at_seam", "composite", "blend",
+        "footprint_weight", "ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"})
     m.impl(name, torch::CppFunction::makeFromBoxedFunction<&differentiate>());
-  for (const char* name : {"prepare_cameras_vjp", "prepare_lens_vjp", "rasterize_vjp",        "project_vjp",
-                           "composite_vjp",       "blend_vjp",        "footprint_weight_vjp", "ssim_map_vjp",
-                           "l1_ssim_vjp",         "activate_vjp",     "apply_3d_filter_vjp",  "correct_colors_vjp",
-                           "picture_gradients",   "rows_picture_gradients", "repeat_at_seam_vjp", "observe_",         "add_noise_",           "adam_",
-                           "count_rows",          "pack_rows_",       "pack_rows_vjp",        "blend_rows",
+  for (const char* name : {"prepare_cameras_vjp",  "prepare_lens_vjp",
+                           "rasterize_vjp",        "project_vjp",
+                           "composite_vjp",        "blend_vjp",
+                           "footprint_weight_vjp", "ssim_map_vjp",
+                           "l1_ssim_vjp",          "activate_vjp",
+                           "apply_3d_filter_vjp",  "correct_colors_vjp",
+                           "picture_gradients",    "rows_picture_gradients",
+                           "repeat_at_seam_vjp",   "observe_",
+                           "add_noise_",           "adam_",
+                           "count_rows",           "pack_rows_",
+                           "pack_rows_vjp",        "blend_rows",
                            "blend_rows_vjp_"})
     m.impl(name, torch::autograd::autogradNotImplementedFallback());
 }

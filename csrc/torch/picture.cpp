@@ -1,6 +1,6 @@
-// The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients of
-// the parameters or, where these are on several ranks, of rows. They call the ops that autograd would call, in the same
-// order, and save the host the cost of autograd.
+// The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients
+// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would call, in the
+// same order, and save the host the cost of autograd.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
 #include <ATen/ops/full.h>
@@ -85,7 +85,7 @@ struct Sphere {
     radii = at::zeros({a.means3D.size(0)}, ids.options()).index_copy_(0, ids.to(at::kLong), projected[5].toTensor());
 
     static_cast<FootprintArguments&>(seam) = a;
-    Tensor* const given[] = {&seam.means2d, &seam.cov2d,        &seam.opacities,  &seam.depths,    &seam.colors,
+    Tensor* const given[] = {&seam.means2d, &seam.cov2d,        &seam.opacities,  &seam.depths,     &seam.colors,
                              &seam.radii,   &seam.gaussian_ids, &seam.camera_ids, &seam.row_splits, &seam.dets};
     for (size_t k = 0; k < std::size(given); ++k) *given[k] = projected[k].toTensor();
     seam.turns = at::full({1}, turn, means2d.options());
@@ -226,8 +226,8 @@ template <class Rendering> Results gradients_through(const PictureArguments& a, 
     grads.scales = of_filter[0];
     grads.opacities = of_filter[1];
   }
-  const std::vector<Tensor> of_parameters = gradients_of(activate_vjp(
-      {{grads.scales, grads.rotations, grads.opacities, a.dL_dloss}, parameters, {}, {true, true, true}}));
+  const std::vector<Tensor> of_parameters = gradients_of(
+      activate_vjp({{grads.scales, grads.rotations, grads.opacities, a.dL_dloss}, parameters, {}, {true, true, true}}));
   std::vector<Tensor> gradients = {grads.means3D, of_parameters[0], of_parameters[1], of_parameters[2], grads.shs};
   if (a.mean_columns > 0) gradients.push_back(grads.means2D);
   if (a.exposure) gradients.push_back(loss.dL_dexposure);

@@ -1,7 +1,7 @@
-// The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are the same line of the sphere,
-// with a row for every place at which a splat may show (docs/internals/numerics.md, "Equirectangular pictures"). And its
-// adjoint. A splat that is wider than the turn overlaps itself: its opacity is lowered, so that all of its copies
-// together are as opaque as it was at its centre.
+// The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are the same line of the
+// sphere, with a row for every place at which a splat may show (docs/internals/numerics.md, "Equirectangular
+// pictures"). And its adjoint. A splat that is wider than the turn overlaps itself: its opacity is lowered, so that all
+// of its copies together are as opaque as it was at its centre.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/exp.h>
@@ -11,6 +11,9 @@
 #include <ATen/ops/stack.h>
 #include <ATen/ops/where.h>
 #include <ATen/ops/zeros.h>
+#include <ATen/ops/zeros_like.h>
+
+#include <iterator>
 
 #include "core/project.h"
 #include "torch/checks.h"
@@ -195,17 +198,16 @@ Results repeat_at_seam_vjp(VjpArguments<SeamArguments> arguments) {
   out[4] = dL_dcolors;
   out[6] = dL_dbeside;
   if (needs[5]) {
-    if (dL_dmeans.defined())
-      dL_dturn = dL_dturn.add(summed_copies(dL_dmeans.select(1, 0).mul(place), counts));
+    if (dL_dmeans.defined()) dL_dturn = dL_dturn.add(summed_copies(dL_dmeans.select(1, 0).mul(place), counts));
     dL_dturn = at::where(narrowed.turn.isfinite(), dL_dturn, 0);
     const Tensor splats = a.row_splits.diff().to(counts.device());  // Summed in order: the same bits in every run.
     out[5] = summed_copies(dL_dturn, splats);
   }
-  const Tensor like[] = {a.means2d, a.cov2d, a.opacities, a.depths, a.colors, a.turns};
+  // The gradient through dets is in that of cov2d.
+  const Tensor like[] = {a.means2d, a.cov2d, a.opacities, a.depths, a.colors, a.turns, a.beside.value_or(Tensor())};
   for (size_t k = 0; k < out.size(); ++k) {
-    const bool zero = needs[k] && !out[k].defined();
-    out[k] = zero ? at::zeros(k < 6 ? like[k].sizes() : a.beside->sizes(), a.means2d.options())
-                  : or_empty(needs[k] ? out[k] : Tensor(), a.means2d);
+    if (needs[k] && !out[k].defined()) out[k] = at::zeros_like(k < std::size(like) ? like[k] : a.dets);
+    out[k] = needs[k] ? out[k] : at::empty({0}, a.means2d.options());
   }
   return {out};
 }

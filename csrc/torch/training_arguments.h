@@ -71,9 +71,9 @@ struct CorrectArguments {
 
 /// How a rendering becomes a loss.
 struct LossArguments {
-  Tensor target, dL_dloss;    ///< As of `l1_ssim`.
-  OptionalTensor exposure;    ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor mask;        ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
+  Tensor target, dL_dloss;  ///< As of `l1_ssim`.
+  OptionalTensor exposure;  ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
+  OptionalTensor mask;      ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
   double ssim_weight = 0;
   int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
 
@@ -92,9 +92,9 @@ struct PictureArguments : LossArguments, CameraNumbers<double>, FootprintArgumen
   int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
-  OptionalTensor filter_3d;  ///< (N,), that of `apply_3d_filter`.
+  OptionalTensor filter_3d;                     ///< (N,), that of `apply_3d_filter`.
   double opacity_weight = 0, scale_weight = 0;  ///< Of the mean opacity and scale, before the filter, in the loss.
-  double turn = 0;  ///< px of a turn in an equirectangular picture. Others have no seam: 0.
+  double turn = 0;                              ///< px of a turn in an equirectangular picture. Others have no seam: 0.
 
   template <class Visit> void each(Visit&& visit) {
     visit("means", means);
