@@ -18,8 +18,5 @@ def rows_shown(trainer) -> list[torch.Tensor]:
     """Which Gaussians each picture of the next step shows."""
     supersampling = trainer.options.supersampling
     with torch.no_grad():
-        return [
-            g.render(g.filtered(trainer.gaussians.arguments(), trainer.filter_3d), s.settings, None, supersampling)[1]
-            > 0
-            for s in trainer._next()
-        ]
+        scene = trainer.scene().arguments()
+        return [g.render(scene, s.settings, None, supersampling)[1] > 0 for s in trainer._next()]
