@@ -10,9 +10,11 @@ ANALYTIC_RASTERIZER_SANITIZE=1 builds the CPU path under AddressSanitizer and Un
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from pathlib import Path
 
 from setuptools import setup
@@ -135,6 +137,33 @@ NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xfatbin", "-co
 NVCC_ARGS += ["-Xcompiler", "-fno-gnu-unique,-fvisibility=hidden"]
 
 
+def succeeds(command: list[str]) -> bool:
+    try:
+        return subprocess.run(command, capture_output=True).returncode == 0
+    except OSError:  # There is no such program.
+        return False
+
+
+def openmp_flags() -> tuple[list[str], list[str]]:
+    """What the compiler and the linker are told for the threads of the CPU path. Says so if there is no OpenMP."""
+    # The copy that torch brings, where it does: it is there wherever the extension is, and threads are shared.
+    of_torch = sorted((Path(torch.__file__).parent / "lib").glob("libgomp*.so*"))
+    name = os.environ.get("CXX", "c++")
+    with tempfile.TemporaryDirectory() as folder:
+        source, made = f"{folder}/openmp.cpp", f"{folder}/openmp.o"
+        Path(source).write_text("int main() {\n#pragma omp parallel\n  {}\n}\n")
+        for library in ([str(of_torch[0])] if of_torch else [], ["-fopenmp"]):
+            commands = [["-fopenmp", "-c", source, "-o", made], [made, *library, "-o", f"{folder}/openmp"]]
+            if all(succeeds([*shlex.split(name), *command]) for command in commands):
+                return ["-fopenmp"], library
+    print(
+        f"analytic_rasterizer: {name} has no OpenMP, so the CPU path will run on one thread. Set CXX to one that has it: "
+        "g++, or clang++ with libomp.",
+        file=sys.stderr,
+    )
+    return [], []
+
+
 class Build(BuildExtension):
     """Builds on every core unless MAX_JOBS says otherwise, and the files of csrc/torch together."""
 
@@ -146,7 +175,10 @@ class Build(BuildExtension):
 
     def build_extensions(self):
         os.environ.setdefault("MAX_JOBS", str(os.cpu_count() or 1))
+        compile_args, link_args = openmp_flags()
         for extension in self.extensions:
+            extension.extra_compile_args["cxx"] += compile_args
+            extension.extra_link_args += link_args
             extension.depends += extension.sources  # a change of any is looked at, without ninja too
             extension.sources = in_units(extension.sources, Path(self.build_temp) / "units")
         super().build_extensions()

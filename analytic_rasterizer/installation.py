@@ -37,21 +37,23 @@ def _way_out() -> str:
     return f"install the wheel of {fitting} (docs/install.md), or build it for this torch, {_INSTALL_AGAIN}"
 
 
-def about(version: str, built_for: str, has_cuda: bool) -> str:
+def about(version: str, built_for: str, has_cuda: bool, has_openmp: bool) -> str:
     """Lines that say what is installed, and which wheels fit the torch that is there.
 
     Args:
         version: Of this package.
         built_for: What the extension says, `_C.BUILT_FOR`.
         has_cuda: Whether the extension has the CUDA path, `_C.has_cuda`.
+        has_openmp: Whether its CPU path has threads, `_C.has_openmp`.
     """
+    cpu = "the CPU" if has_openmp else "one thread of the CPU (its compiler had no OpenMP)"
+    devices = f"{cpu} and CUDA" if has_cuda else cpu
     cuda = f"CUDA {torch.version.cuda}" if torch.version.cuda else "no CUDA"
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU is visible"
     fitting = wheel_folder(torch.__version__, torch.version.cuda)
     return "\n".join(
         (
-            f"analytic_rasterizer {version}, built for torch {built_for.removeprefix(_BUILT_FOR)}, "
-            f"for {'the CPU and CUDA' if has_cuda else 'the CPU'}",
+            f"analytic_rasterizer {version}, built for torch {built_for.removeprefix(_BUILT_FOR)}, for {devices}",
             f"torch {torch.__version__} with {cuda}, Python {platform.python_version()}, {device}",
             "the wheels that fit this torch, where INDEX is the folder or the address of the wheels:",
             f"    pip install --index-url INDEX/{fitting} analytic-rasterizer",

@@ -2,6 +2,7 @@
 
 set(THREADS_PREFER_PTHREAD_FLAG ON)
 find_package(Threads REQUIRED)
+find_package(OpenMP COMPONENTS CXX)
 
 if(BUILD_TESTING)
   find_package(GTest QUIET)

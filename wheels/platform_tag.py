@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-OF_TORCH = re.compile(r"lib(torch|c10|cudart)\w*\.so(\.\d+)?")
+OF_TORCH = re.compile(r"lib(torch\w*|c10\w*|cudart\w*|gomp(-\w+)?)\.so(\.\d+)*")
 OF_SYSTEM = re.compile(r"(ld-linux-[\w-]+|lib(c|m|dl|pthread|rt|gcc_s|stdc\+\+))\.so(\.\d+)?")
 # Which glibc has a system whose libraries have these versions: of distributions with that glibc, by PEP 600's rule that
 # a wheel must run on all of them.

@@ -54,5 +54,5 @@ def build_parser() -> Parser:
 
 
 def _say_what_is_installed(_arguments: object) -> None:
-    print(about(__version__, _C.BUILT_FOR, _C.has_cuda))
+    print(about(__version__, _C.BUILT_FOR, _C.has_cuda, _C.has_openmp))
     print("python -m analytic_rasterizer --help lists the commands")

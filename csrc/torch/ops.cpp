@@ -225,6 +225,11 @@ std::pair<std::vector<std::string>, std::vector<std::string>> blend_route(const 
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Loads the ops of analytic_rasterizer into torch.ops.analytic_rasterizer.";
   m.attr("BUILT_FOR") = ar::ops::kBuiltFor;
+#if defined(_OPENMP)
+  m.attr("has_openmp") = true;
+#else
+  m.attr("has_openmp") = false;
+#endif
 #if defined(AR_WITH_CUDA)
   m.attr("has_cuda") = true;
   m.def("force_pair_capacity", &ar::ops::force_pair_capacity,

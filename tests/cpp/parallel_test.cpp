@@ -71,6 +71,7 @@ TEST(ParallelTest, BodiesNeedNoNumberOfTheThread) {
   for (int i = 0; i < 100; ++i) EXPECT_EQ(out[i], i);
 }
 
+#if defined(_OPENMP)
 TEST(ParallelTest, ThreadsWorkAtTheSameTime) {
   for (const int threads : {2, 5}) {
     Meeting meeting(threads);
@@ -86,10 +87,9 @@ TEST(ParallelTest, ThreadsWorkAtTheSameTime) {
   }
 }
 
-TEST(ParallelTest, NobodyWaitsForThreadsThatDoNotCome) {
+TEST(ParallelTest, LoopsOfTwoCallersDoNotWaitForEachOther) {
   constexpr int kThreads = 4;
-  // All threads that there are stay in the first loop until the second one is over.
-  cpu::parallel_for(1000, kThreads, [](int64_t) {});
+  // Four threads stay in the first loop until the second one is over.
   Meeting inside(kThreads + 1), over(kThreads + 1);
   std::thread first([&] { cpu::parallel_for(kThreads, kThreads, [&](int64_t) { inside.meet() && over.meet(); }); });
   EXPECT_TRUE(inside.meet());
@@ -97,11 +97,12 @@ TEST(ParallelTest, NobodyWaitsForThreadsThatDoNotCome) {
   EXPECT_TRUE(over.meet());
   first.join();
 }
+#endif
 
 TEST(ParallelTest, ManyCallers) {
   std::atomic<int> right{0};
   std::vector<std::thread> callers;
-  for (int c = 0; c < 12; ++c) {  // more than may have helpers at the same time
+  for (int c = 0; c < 12; ++c) {
     callers.emplace_back([&right, c] {
       for (int i = 0; i < 200; ++i) right += runs_every_item_once(1 + (i * 7 + c) % 40, 2 + (i + c) % 4);
     });
@@ -144,40 +145,49 @@ template <class IsRight> bool in_a_child(const IsRight& is_right) {
   return waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 0;
 }
 
-/// Whether loops run, on two threads at the same time.
-bool has_helpers() {
-  Meeting meeting(2);
-  std::atomic<bool> have_met{true};
-  cpu::parallel_for(2, 2, [&](int64_t) {
-    if (!meeting.meet()) have_met = false;
+/// Whether loops run, all on the thread that began them.
+bool runs_alone() {
+  const std::thread::id caller = std::this_thread::get_id();
+  std::atomic<bool> is_alone{true};
+  cpu::parallel_for(1000, 3, [&](int64_t, int thread) {
+    if (thread != 0 || std::this_thread::get_id() != caller) is_alone = false;
   });
-  return have_met && runs_every_item_once(1000, 3);
+  return is_alone && runs_every_item_once(1000, 3);
 }
 
-TEST(ParallelTest, AForkedChildHasThreadsOfItsOwn) {
+TEST(ParallelTest, AForkedChildRunsLoopsOnOneThread) {
   EXPECT_TRUE(runs_every_item_once(1000, 3));
-  EXPECT_TRUE(in_a_child(has_helpers));
+  EXPECT_TRUE(in_a_child(runs_alone));
+  EXPECT_TRUE(in_a_child([] { return in_a_child(runs_alone); }));
   EXPECT_TRUE(runs_every_item_once(1000, 3));
 }
 
 TEST(ParallelTest, ForkedWhileAnotherThreadIsInALoop) {
-  Meeting inside(3), over(3);
-  std::thread other([&] { cpu::parallel_for(2, 2, [&](int64_t) { inside.meet() && over.meet(); }); });
+  Meeting inside(2), over(2);
+  std::thread other([&] {
+    cpu::parallel_for(2, 2, [&](int64_t item) {
+      if (item == 0) inside.meet() && over.meet();
+    });
+  });
   EXPECT_TRUE(inside.meet());
-  EXPECT_TRUE(in_a_child(has_helpers));
+  EXPECT_TRUE(in_a_child(runs_alone));
   EXPECT_TRUE(over.meet());
   other.join();
 }
 
 #if defined(__linux__)
+/// Whether a loop with 40 threads runs where there is no memory for the stack of a thread.
+bool runs_without_room() {
+  int64_t pages = 0;
+  std::ifstream("/proc/self/statm") >> pages;
+  const rlim_t room = rlim_t(pages) * sysconf(_SC_PAGESIZE) + (1 << 20);
+  const rlimit limit = {room, room};
+  return setrlimit(RLIMIT_AS, &limit) == 0 && runs_every_item_once(1000, 40);
+}
+
 TEST(ParallelTest, WithoutRoomForThreadsTheCallerDoesAll) {
-  EXPECT_TRUE(in_a_child([] {
-    int64_t pages = 0;
-    std::ifstream("/proc/self/statm") >> pages;
-    const rlim_t room = rlim_t(pages) * sysconf(_SC_PAGESIZE) + (1 << 20);  // less than the stack of a thread
-    const rlimit limit = {room, room};
-    return setrlimit(RLIMIT_AS, &limit) == 0 && runs_every_item_once(1000, 40);
-  }));
+  ::testing::FLAGS_gtest_death_test_style = "threadsafe";  // The program again, which is no forked child.
+  EXPECT_EXIT(_exit(runs_without_room() ? 0 : 1), ::testing::ExitedWithCode(0), "");
 }
 #endif
 #endif

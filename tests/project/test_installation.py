@@ -126,6 +126,9 @@ def test_the_folder_of_the_wheels_that_fit(version, cuda, folder):
 
 
 def test_what_is_installed_is_said_with_the_wheels_that_fit():
-    text = installation.about("1.2.3", "analytic_rasterizer was built for torch 2.11.0+cu130", has_cuda=True)
+    built_for = "analytic_rasterizer was built for torch 2.11.0+cu130"
+    text = installation.about("1.2.3", built_for, has_cuda=True, has_openmp=True)
     assert text.startswith("analytic_rasterizer 1.2.3, built for torch 2.11.0+cu130, for the CPU and CUDA\n")
     assert f"--index-url INDEX/{HERE} analytic-rasterizer" in text
+    text = installation.about("1.2.3", built_for, has_cuda=False, has_openmp=False)
+    assert text.splitlines()[0].endswith("for one thread of the CPU (its compiler had no OpenMP)")
