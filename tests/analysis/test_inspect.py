@@ -8,13 +8,13 @@ import pytest
 import reference
 import scenes
 import torch
+from gaussians import of_inputs
 from places import SHARED
 from scenes import Camera
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis import planner
-from analytic_rasterizer.gaussians import Gaussians
 
 TOLERANCE = 1 / 255
 CAMERAS = [Camera(image_height=61, image_width=83), Camera(image_height=52, image_width=40, eye=(-3.0, 1.5, -3.0))]
@@ -26,11 +26,7 @@ def random_scene(device, seed=0, count=800, sizes="mixed", bands="none"):
     factors = torch.cat([torch.full((2 * band + 1,), scale) for band, scale in enumerate(BANDS[bands])])
     inputs = scenes.random_scene(seed, count, len(BANDS[bands]) - 1, sigma=SIZES[sizes])
     inputs["shs"] = inputs["shs"] * factors[:, None]
-    return to_scene(scenes.cast(inputs, torch.float32, device))
-
-
-def to_scene(inputs):
-    return Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
+    return of_inputs(scenes.cast(inputs, torch.float32, device))
 
 
 def settings(device, *cameras):
@@ -290,7 +286,7 @@ def test_errors_come_before_anything_is_rendered(monkeypatch, changed, error, me
 @pytest.mark.parametrize("name", ["plant", "hqgarden"])
 def test_trained_scenes(name, request):
     inputs, _ = request.getfixturevalue(name)
-    scene = to_scene(inputs)
+    scene = of_inputs(inputs)
     stored = {"plant": "plant_sh3_lo.json", "hqgarden": "hqgarden_lod1_sh0_lo.json"}[name]
     view = io.load_views(SHARED / "data" / stored)[0]
     torch.set_num_threads(2)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from cli_extra import image
+from gaussians import of_inputs
 from places import SHARED
 
 import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.analysis import pareto, reference, tables, timing
-from analytic_rasterizer.gaussians import Gaussians
 
 pytest.importorskip("torchmetrics", reason="needs the analysis extra")
 pytest.importorskip("matplotlib", reason="needs the analysis extra")
@@ -442,7 +442,7 @@ def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
 def test_trained_scene(tmp_path, plant):
     """Four samples go beyond what one weight per splat can, on a scene that was not made for it."""
     inputs, _ = plant
-    scene = Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
+    scene = of_inputs(inputs)
     views = io.load_views(SHARED / "data" / "plant_sh3_lo.json")
     methods = [pareto.parse_method(text) for text in ("analytic", "box:samples=1", "box:samples=4")]
     results = pareto.run(tmp_path, scene, views[:1], [1], methods, crop=(96, 64), rounds=1)

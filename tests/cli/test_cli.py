@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 import torch
 from cli_extra import image
+from gaussians import EYE, make_scene, make_view, of_inputs
 from places import SHARED
 from processes import DEADLINE, python_path, run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.cli import arguments as arguments_of_commands
-from analytic_rasterizer.gaussians import Gaussians
 
 FOOTPRINT_ARGUMENTS = {
     "default": ([], {"footprint": "point"}),  # what a file wants that says nothing
@@ -37,21 +37,8 @@ FOOTPRINT_ARGUMENTS = {
 @pytest.fixture
 def files(tmp_path):
     """A small scene and two views of it, one with its principal point off centre."""
-    g = torch.Generator().manual_seed(0)
-    count = 30
-    scene = Gaussians.from_activated(
-        2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
-        0.3 * torch.rand(count, 3, generator=g) + 0.01,
-        torch.randn(count, 4, generator=g),
-        torch.rand(count, 1, generator=g),
-        0.5 * torch.randn(count, 9, 3, generator=g),
-    )
-    eye = torch.eye(4, dtype=torch.float64)
-    views = [
-        io.View("front", 64, 48, 70.0, 70.0, eye),
-        io.View("off centre", 50, 40, 60.0, 65.0, eye, cx=20.0, cy=25.0),
-    ]
-    io.save_scene(tmp_path / "scene.ply", scene)
+    views = [make_view(), io.View("off centre", 50, 40, 60.0, 65.0, EYE, cx=20.0, cy=25.0)]
+    io.save_scene(tmp_path / "scene.ply", make_scene())
     io.save_views(tmp_path / "views.json", views)
     return tmp_path
 
@@ -534,7 +521,7 @@ def test_without_a_command_it_says_what_is_installed(capsys):
 
 def test_shared_views(tmp_path, plant):
     inputs, _ = plant
-    scene = Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
+    scene = of_inputs(inputs)
     io.save_scene(tmp_path / "scene.ply", scene)
     views = SHARED / "data" / "plant_sh3_lo.json"
     args = ["render", str(tmp_path / "scene.ply"), "--views", str(views), "--out", str(tmp_path)]

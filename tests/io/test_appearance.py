@@ -10,28 +10,17 @@ import numpy as np
 import pytest
 import torch
 from cli_extra import image
+from gaussians import make_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.cli.arguments import use_machine
-from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.io.models import CfgArgs, read_cfg_args
 from analytic_rasterizer.training.options import TrainingOptions
 
 UNMARKED = "point:dilation=0.3"
 MIP = "mip:variance=0.1"
 DEEP = "MODEL/point_cloud/iteration_30000/point_cloud.ply"
-
-
-def make_scene(count=30):
-    g = torch.Generator().manual_seed(0)
-    return Gaussians.from_activated(
-        2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
-        0.3 * torch.rand(count, 3, generator=g) + 0.01,
-        torch.randn(count, 4, generator=g),
-        torch.rand(count, 1, generator=g),
-        0.5 * torch.randn(count, 1, 3, generator=g),
-    )
 
 
 def make_views(width=64, height=48):
@@ -57,7 +46,7 @@ FILTERED = {"filter_3D": 0.02}  # a scene as Mip-Splatting and Analytic-Splattin
 def add_column(path, name, value):
     """Another float32 in every row of a .ply that `save_scene` wrote."""
     header, end, rows = path.read_bytes().partition(b"end_header\n")
-    rows = np.frombuffer(rows, np.uint8).reshape(make_scene().count, -1)
+    rows = np.frombuffer(rows, np.uint8).reshape(make_scene(degree=0).count, -1)
     column = np.full((len(rows), 1), value, np.float32).view(np.uint8)
     path.write_bytes(header + f"property float {name}\n".encode() + end + np.hstack([rows, column]).tobytes())
 
@@ -73,10 +62,10 @@ def write(folder, contents):
         elif isinstance(content, str):
             path.write_text(content)
         elif content is FILTERED:
-            io.save_scene(path, make_scene())
+            io.save_scene(path, make_scene(degree=0))
             add_column(path, "filter_3D", 0.02)
         else:
-            io.save_scene(path, make_scene(), io.SceneMetadata(**(content or {})))
+            io.save_scene(path, make_scene(degree=0), io.SceneMetadata(**(content or {})))
 
 
 MOMENT, BOX, MARKED, POINT = (
@@ -284,7 +273,7 @@ def test_size_of_the_pictures_of_a_training_of_3dgs(images, resolution, size):
 def test_views_are_in_the_frame_of_the_scene(tmp_path):
     """Of a capture in map coordinates the scene has an offset; views say theirs, or are in the world."""
     offset = (500000.0, 4200000.0, 100.0)
-    io.save_scene(tmp_path / "scene.ply", make_scene(), io.SceneMetadata(footprint="moment", offset=offset))
+    io.save_scene(tmp_path / "scene.ply", make_scene(degree=0), io.SceneMetadata(footprint="moment", offset=offset))
     here = make_views()
     io.save_views(tmp_path / "cameras.json", [replace(view, offset=offset) for view in here])
     io.save_views(tmp_path / "world.json", [replace(view, offset=offset).in_frame(None) for view in here])
@@ -441,7 +430,7 @@ def test_bake_takes_the_size_of_the_training(model, tmp_path, capsys):
         assert "2 pictures of 64x48" in capsys.readouterr().out
     contents = {(tmp_path / f"{name}.ply").read_bytes() for name in ways}
     assert len(contents) == 1
-    baked, scene = io.load_scene(tmp_path / "known.ply"), make_scene()
+    baked, scene = io.load_scene(tmp_path / "known.ply"), make_scene(degree=0)
     cameras = [view.settings() for view in make_views()]
     scales, _ = ar.bake_dilation(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
     torch.testing.assert_close(baked.scales, scales, rtol=1e-5, atol=1e-6)
@@ -469,7 +458,7 @@ def test_a_scene_of_mip_splatting_is_shown_with_its_filter_and_not_baked(tmp_pat
     assert run(["render", str(model), "--out", str(tmp_path / "out")]) == 0
     reason = "cfg_args says kernel_size 0.2, the variance of Mip-Splatting's filter"
     assert capsys.readouterr().err.endswith(f"footprint mip:variance=0.2: {reason}\n")
-    expected = shown(make_scene(), make_views()[0], "mip:variance=0.2", io.BLACK)
+    expected = shown(make_scene(degree=0), make_views()[0], "mip:variance=0.2", io.BLACK)
     assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
     assert run(["bake", str(model), "--out", str(tmp_path / "b.ply")]) == 2
     assert f"no dilation to bake: it says that pixels are to be integrated (footprint mip:variance=0.2: {reason})" in (
@@ -548,7 +537,7 @@ def test_views_are_those_of_a_scene_far_from_zero(tmp_path):
         views = ["--views", str(tmp_path / f"{name}.json"), "--out", str(tmp_path / name)]
         assert run(["render", str(tmp_path / "a.ply"), *views]) == 0
         pictures.append(picture(tmp_path / name / "right.png"))
-    expected = shown(make_scene(), make_views()[1], "box", io.BLACK)
+    expected = shown(make_scene(degree=0), make_views()[1], "box", io.BLACK)
     assert expected.max() > 100 and np.abs(pictures[0] - expected).max() <= 1
     for found in pictures[1:]:
         assert np.abs(found - pictures[0]).max() <= 1

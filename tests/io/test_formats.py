@@ -15,21 +15,11 @@ import numpy as np
 import pytest
 import torch
 from cli_extra import image
+from gaussians import random_gaussians
 from ply_files import CAMERA, CODES, FLAGS, TRIANGLES, Element, ply
 
-from analytic_rasterizer import Gaussians, io
+from analytic_rasterizer import io
 from analytic_rasterizer.io.ply import TYPES, read_header, read_rows
-
-
-def random_scene(count=40, degree=3):
-    g = torch.Generator().manual_seed(3)
-
-    def normal(*size):
-        return torch.randn(*size, generator=g)
-
-    rotations = torch.nn.functional.normalize(normal(count, 4), dim=1)
-    shs = 0.2 * normal(count, (degree + 1) ** 2, 3)
-    return Gaussians(normal(count, 3), 0.5 * normal(count, 3) - 3, rotations, 2 * normal(count, 1), shs)
 
 
 def turned_by(a, b):
@@ -114,7 +104,7 @@ ROUNDED = 1 + 2**-10
 @pytest.mark.parametrize("name", ["a.compressed.ply", "a.spz", "a.sog", "a.splat"])
 def test_errors_are_half_a_step_of_the_format(tmp_path, name):
     """And not much less, so that a step that is twice as large is noticed."""
-    scene, path = random_scene(2000), tmp_path / name
+    scene, path = random_gaussians(2000), tmp_path / name
     if name == "a.sog":
         path.write_bytes(sog_file(scene))
     else:
@@ -138,7 +128,7 @@ def test_errors_are_half_a_step_of_the_format(tmp_path, name):
 
 def test_a_ply_comes_back_to_the_bit(tmp_path):
     """Parameters as they are: quaternions of any length, large logits, scales of 0."""
-    scene = random_scene()
+    scene = random_gaussians()
     scene = scene._replace(rotations=3 * scene.rotations, logit_opacities=20 * scene.logit_opacities)
     scene.log_scales[0, 1] = -math.inf
     scene.rotations[1] = 0
@@ -159,7 +149,7 @@ def test_a_ply_comes_back_to_the_bit(tmp_path):
 @pytest.mark.parametrize("name", ["a.compressed.ply", "a.spz", "a.splat", "a.glb"])
 def test_scales_of_zero_and_zero_quaternions_spoil_nothing(tmp_path, name):
     """In a compressed .ply a logarithm of -inf made NaN of the scales of 256 Gaussians."""
-    scene = random_scene(degree=0)
+    scene = random_gaussians(degree=0)
     scene.log_scales[0, 1] = -math.inf
     scene.rotations[1] = 0
     io.save_scene(tmp_path / name, scene)
@@ -198,7 +188,7 @@ def test_a_splat_by_hand(tmp_path):
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz"])
 def test_a_file_of_another_format_is_no_splat(tmp_path, name):
     """Where its size is that of whole rows, it would be read as numbers of no meaning."""
-    io.save_scene(tmp_path / name, random_scene(degree=0))
+    io.save_scene(tmp_path / name, random_gaussians(degree=0))
     content = (tmp_path / name).read_bytes()
     (tmp_path / "b.splat").write_bytes(content + bytes(-len(content) % 32))
     with pytest.raises(io.SceneError, match=rf"b\.splat: a {(tmp_path / name).suffix}, and no \.splat: rename it"):
@@ -212,7 +202,7 @@ def test_a_folder_is_no_file_of_a_scene(tmp_path):
 
 
 def test_a_splat_round_trip(tmp_path):
-    scene = random_scene(degree=0)
+    scene = random_gaussians(degree=0)
     io.save_scene(tmp_path / "a.splat", scene)
     close(io.load_scene(tmp_path / "a.splat"), scene)
     scene.shs[:2, 0] = torch.tensor([[9.0], [-9.0]])  # clamped, and not wrapped around
@@ -273,7 +263,7 @@ OURS = record(0x41520001, b"analytic_rasterizer footprint moment:samples=16\nana
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("flags, records", [(0, b""), (1, b""), (3, record(0xADBE0002, b"\1" * 12) + OURS)])
 def test_an_spz_by_hand(tmp_path, version, degree, flags, records):
-    scene = random_scene(degree=degree)
+    scene = random_gaussians(degree=degree)
     (tmp_path / "a.Spz").write_bytes(spz_file(scene, version, flags, records))
     # Version 2 has 8 bits for x, y and z of a quaternion; w, which follows from them, may be small.
     close(io.load_scene(tmp_path / "a.Spz"), scene, turned=1e-2 if version == 2 else 1e-4)
@@ -285,7 +275,7 @@ def test_an_spz_by_hand(tmp_path, version, degree, flags, records):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_a_broken_spz(tmp_path, version):
-    whole = spz_file(random_scene(), version)
+    whole = spz_file(random_gaussians(), version)
     (tmp_path / "a.spz").write_bytes(whole)
     io.load_scene(tmp_path / "a.spz")
     for size in (0, 3, 10, 20, 33, 60, len(whole) // 2, len(whole) - 1):
@@ -302,8 +292,8 @@ def test_a_broken_spz(tmp_path, version):
 
 
 def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch):
-    (tmp_path / "a.spz").write_bytes(spz_file(random_scene(degree=0), 4))
-    (tmp_path / "a.sog").write_bytes(sog_file(random_scene(degree=0)))
+    (tmp_path / "a.spz").write_bytes(spz_file(random_gaussians(degree=0), 4))
+    (tmp_path / "a.sog").write_bytes(sog_file(random_gaussians(degree=0)))
     for module, name in (("zstandard", "a.spz"), ("PIL.Image", "a.sog")):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match=rf"{module[:3]}\w*: pip install analytic_rasterizer\[cli\]"):
@@ -369,7 +359,7 @@ def sog_file(scene, **meta):
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_sog_by_hand(tmp_path, degree):
-    scene = random_scene(count=80, degree=degree)
+    scene = random_gaussians(count=80, degree=degree)
     (tmp_path / "a.SOG").write_bytes(sog_file(scene))
     close(io.load_scene(tmp_path / "a.SOG"), scene)
 
@@ -380,7 +370,7 @@ def test_a_sog_by_hand(tmp_path, degree):
      ({"model": "2dgs"}, False), ({"antialias": "?"}, None)],
 )  # fmt: skip
 def test_the_tag_of_a_sog(tmp_path, meta, antialiased):
-    (tmp_path / "a.sog").write_bytes(sog_file(random_scene(degree=0), **meta))
+    (tmp_path / "a.sog").write_bytes(sog_file(random_gaussians(degree=0), **meta))
     assert io.read_metadata(tmp_path / "a.sog") == io.SceneMetadata(antialiased=antialiased)
 
 
@@ -389,10 +379,10 @@ def test_the_tag_of_a_sog(tmp_path, meta, antialiased):
     [{"version": 3}, {"count": 10**9}, {"count": "many"}, {"scales": {"codebook": [0.5]}}, {"sh0": 3}, {"means": {}}],
 )
 def test_a_broken_sog(tmp_path, meta):
-    (tmp_path / "a.sog").write_bytes(sog_file(random_scene(degree=0), **meta))
+    (tmp_path / "a.sog").write_bytes(sog_file(random_gaussians(degree=0), **meta))
     with pytest.raises(io.SceneError, match=r"a\.sog: (unreadable or cut short|expected )"):
         io.load_scene(tmp_path / "a.sog")
-    for content in (b"", b"no archive", sog_file(random_scene(degree=0))[:-30]):
+    for content in (b"", b"no archive", sog_file(random_gaussians(degree=0))[:-30]):
         (tmp_path / "a.sog").write_bytes(content)
         for read in (io.load_scene, io.read_metadata):
             with pytest.raises(io.SceneError, match=r"a\.sog: unreadable or cut short"):
@@ -441,7 +431,7 @@ COMPRESSED = {
 def test_compressed_scenes_whatever_the_file(tmp_path, name):
     """gsply takes elements for what it expects at their place, and text for ASCII."""
     path = tmp_path / "a.compressed.ply"
-    io.save_scene(path, random_scene(count=300, degree=1))
+    io.save_scene(path, random_gaussians(count=300, degree=1))
     expected = io.load_scene(path)
     rearranged(path, COMPRESSED[name])
     assert io.is_scene(path)
@@ -450,7 +440,7 @@ def test_compressed_scenes_whatever_the_file(tmp_path, name):
 
 
 def test_a_compressed_scene_without_limits_of_colours(tmp_path):
-    scene = random_scene(count=30, degree=1)
+    scene = random_gaussians(count=30, degree=1)
     scene = scene._replace(shs=scene.shs.clamp(-1.7, 1.7))
     scene.shs[:2, 0] = torch.tensor([[0.5], [-0.5]]) / 0.28209479177387814  # so that the limits are 0 and 1
     path = tmp_path / "a.ply"
@@ -474,7 +464,7 @@ def test_a_compressed_scene_without_limits_of_colours(tmp_path):
 def test_compressed_scenes_that_cannot_be_read(tmp_path, change, message):
     """More vertices than chunks were read from beyond the end of the memory."""
     path = tmp_path / "a.compressed.ply"
-    io.save_scene(path, random_scene(count=300, degree=1))
+    io.save_scene(path, random_gaussians(count=300, degree=1))
     rearranged(path, change)
     with pytest.raises(io.SceneError, match=message) as caught:
         io.load_scene(path)
@@ -501,7 +491,7 @@ METADATA = {
 @pytest.mark.parametrize("name", HOLDING)
 def test_what_a_scene_says_comes_back(tmp_path, name, metadata):
     """Beside it lies one that says something else, and the file is copied away."""
-    scene = random_scene(degree=1)
+    scene = random_gaussians(degree=1)
     io.save_scene(tmp_path / f"plain.{name}", scene)
     io.save_scene(tmp_path / name, scene, metadata)
     (tmp_path / "away").mkdir()
@@ -522,16 +512,16 @@ def test_what_a_scene_says_comes_back(tmp_path, name, metadata):
 
 def test_a_default_footprint_is_written_with_its_options(tmp_path):
     """Another version may have another default."""
-    io.save_scene(tmp_path / "a.ply", random_scene(), io.SceneMetadata(footprint="box"))
+    io.save_scene(tmp_path / "a.ply", random_gaussians(), io.SceneMetadata(footprint="box"))
     header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode().splitlines()
     assert header[2:4] == ["comment SplatRenderMode: mip", "comment analytic_rasterizer footprint box:samples=4"]
-    io.save_scene(tmp_path / "a.ply", random_scene(), io.SceneMetadata(footprint="point"))
+    io.save_scene(tmp_path / "a.ply", random_gaussians(), io.SceneMetadata(footprint="point"))
     assert b"SplatRenderMode" not in (tmp_path / "a.ply").read_bytes()
 
 
 def test_other_programs_read_an_spz_with_an_extension(tmp_path):
     """The Gaussians come first, as in a file without one; then a record that says its length."""
-    scene = random_scene(degree=1)
+    scene = random_gaussians(degree=1)
     for name, metadata in (("a.spz", None), ("b.spz", io.SceneMetadata(footprint="moment"))):
         io.save_scene(tmp_path / name, scene, metadata)
     plain, tagged = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("a.spz", "b.spz"))
@@ -551,12 +541,12 @@ def test_other_programs_read_an_spz_with_an_extension(tmp_path):
 )
 def test_a_splat_holds_no_metadata_and_saving_says_so(tmp_path, metadata, lost):
     with pytest.warns(UserWarning, match=rf"a\.splat: a \.splat does not hold {lost}"):
-        io.save_scene(tmp_path / "a.splat", random_scene(degree=0), metadata)
+        io.save_scene(tmp_path / "a.splat", random_gaussians(degree=0), metadata)
     assert io.read_metadata(tmp_path / "a.splat") == io.SceneMetadata()
 
 
 def test_a_splat_holds_no_harmonics_and_saving_says_so(tmp_path, recwarn):
-    scene = random_scene(degree=2)
+    scene = random_gaussians(degree=2)
     with pytest.warns(UserWarning, match=r"not hold harmonics beyond degree 0 \(the scene has degree 2\)"):
         io.save_scene(tmp_path / "a.splat", scene)
     assert torch.equal(io.load_scene(tmp_path / "a.splat").means, scene.means)
@@ -587,7 +577,7 @@ def test_a_splat_holds_no_harmonics_and_saving_says_so(tmp_path, recwarn):
 @pytest.mark.parametrize("name", ["a.ply", "A.COMPRESSED.PLY"])
 def test_comments_of_other_programs(tmp_path, name, lines, expected):
     path = tmp_path / name
-    io.save_scene(path, random_scene())
+    io.save_scene(path, random_gaussians())
     content = path.read_bytes()
     for newline in (b"\n", b"\r\n"):
         header, end, rows = content.partition(b"end_header\n")
@@ -602,7 +592,7 @@ def test_comments_of_other_programs(tmp_path, name, lines, expected):
     "line", ["footprint blob", "footprint", "footprint box:samples=3", "offset 1 2", "offset 1 2 x", "offset 1 2 nan"]
 )
 def test_lines_of_ours_that_make_no_sense_are_told(tmp_path, line):
-    io.save_scene(tmp_path / "a.ply", random_scene(), io.SceneMetadata(antialiased=True, comments=("b",)))
+    io.save_scene(tmp_path / "a.ply", random_gaussians(), io.SceneMetadata(antialiased=True, comments=("b",)))
     content = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(content.replace(b"comment b", b"comment analytic_rasterizer " + line.encode()))
     with pytest.warns(UserWarning, match=rf"a\.ply: 'analytic_rasterizer {line}' is not understood \("):
@@ -624,7 +614,7 @@ def test_lines_of_ours_that_make_no_sense_are_told(tmp_path, line):
 @pytest.mark.parametrize("name", [*HOLDING, "a.splat"])
 def test_metadata_that_cannot_be_written(tmp_path, name, metadata, message):
     with pytest.raises(io.SceneError, match=rf"{name}: .*{message}"):
-        io.save_scene(tmp_path / name, random_scene(degree=0), metadata)
+        io.save_scene(tmp_path / name, random_gaussians(degree=0), metadata)
     assert not list(tmp_path.iterdir())
 
 
@@ -639,7 +629,7 @@ def test_metadata_of_what_is_no_scene(tmp_path):
 
 def test_a_column_with_a_3d_filter_is_named(tmp_path):
     """Mip-Splatting keeps its filter apart; without it the scene looks thinner."""
-    io.save_scene(tmp_path / "plain.ply", random_scene(count=1, degree=0))
+    io.save_scene(tmp_path / "plain.ply", random_gaussians(count=1, degree=0))
     content = (tmp_path / "plain.ply").read_bytes()
     content = content.replace(b"end_header", b"property float filter_3D\nend_header") + struct.pack("<f", 0.1)
     (tmp_path / "mip.ply").write_bytes(content)

@@ -10,9 +10,10 @@ import subprocess
 import numpy as np
 import pytest
 import torch
+from gaussians import random_gaussians
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import Gaussians, io
+from analytic_rasterizer import io
 from analytic_rasterizer.io.gltf import NAME
 
 VALIDATE = """
@@ -22,20 +23,9 @@ validator.validateBytes(new Uint8Array(files.readFileSync(process.argv[1])))
 """
 
 
-def random_scene(count=30, degree=3):
-    g = torch.Generator().manual_seed(5)
-
-    def normal(*size):
-        return torch.randn(*size, generator=g)
-
-    rotations = torch.nn.functional.normalize(normal(count, 4).double(), dim=1).float()
-    shs = 0.3 * normal(count, (degree + 1) ** 2, 3)
-    return Gaussians(normal(count, 3), 0.4 * normal(count, 3) - 2, rotations, 2 * normal(count, 1), shs)
-
-
 def content_of(path, **changed):
     """The JSON of a .gltf that `save_scene` wrote."""
-    io.save_scene(path, random_scene(**changed))
+    io.save_scene(path, random_gaussians(**changed))
     return json.loads(path.read_text())
 
 
@@ -49,7 +39,7 @@ def refused(path, content, message):
 @pytest.mark.parametrize("name", ["a.glb", "a.GLTF"])
 def test_a_scene_comes_back_to_float32(tmp_path, name, degree):
     """Scales and opacities are stored as they are: their logarithms come back to the rounding of these."""
-    scene = random_scene(degree=degree)
+    scene = random_gaussians(degree=degree)
     io.save_scene(tmp_path / name, scene)
     found = io.load_scene(tmp_path / name, strict=True)
     assert torch.equal(found.means, scene.means) and torch.equal(found.shs, scene.shs)
@@ -75,7 +65,7 @@ def turn(seed):
 
 @pytest.mark.parametrize("way", ["matrix", "parts", "parents"])
 def test_what_a_node_turns_looks_the_same_from_the_turned_camera(tmp_path, way):
-    scene, path = random_scene(), tmp_path / "a.gltf"
+    scene, path = random_gaussians(), tmp_path / "a.gltf"
     content = content_of(path)
     rotation, quaternion = turn(2)
     shift, size = [0.3, -0.2, 0.5], 2.0
@@ -204,7 +194,7 @@ def test_what_is_refused(tmp_path, change, message):
 @pytest.mark.parametrize("name", ["a.glb", "a.gltf"])
 def test_files_cut_short(tmp_path, name):
     """At every length."""
-    io.save_scene(tmp_path / name, random_scene(2, degree=0))
+    io.save_scene(tmp_path / name, random_gaussians(2, degree=0))
     whole = (tmp_path / name).read_bytes()
     for length in range(len(whole)):
         (tmp_path / name).write_bytes(whole[:length])
@@ -214,9 +204,9 @@ def test_files_cut_short(tmp_path, name):
 
 def test_what_a_gltf_does_not_hold(tmp_path):
     with pytest.raises(io.SceneError, match=r"a\.glb: harmonics of degree 4"):
-        io.save_scene(tmp_path / "a.glb", random_scene(degree=4))
+        io.save_scene(tmp_path / "a.glb", random_gaussians(degree=4))
     with pytest.raises(io.SceneError, match=r"a\.glb: .*without Gaussians"):
-        io.save_scene(tmp_path / "a.glb", random_scene(0))
+        io.save_scene(tmp_path / "a.glb", random_gaussians(0))
     assert not list(tmp_path.iterdir())
 
 
@@ -226,7 +216,7 @@ def test_the_validator_of_khronos_finds_only_the_extension_that_it_does_not_know
     if node is None or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
         pytest.skip("needs node, and npm's gltf-validator in NODE_PATH")
     path = tmp_path / name
-    io.save_scene(path, random_scene(), io.SceneMetadata(footprint="moment"))
+    io.save_scene(path, random_gaussians(), io.SceneMetadata(footprint="moment"))
 
     def codes():
         found = subprocess.run([node, "-e", VALIDATE, str(path)], capture_output=True, text=True, check=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cli_extra import image
+from gaussians import random_gaussians
 from places import SHARED
 
 from analytic_rasterizer import io
@@ -43,17 +44,6 @@ def write_ply(path, columns, rows, kinds=None, form="binary_little_endian", afte
 
 def random_rows(columns, count=5, seed=0):
     return np.random.default_rng(seed).normal(size=(count, len(columns))).astype(np.float32)
-
-
-def random_scene(count=300, degree=3, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians.from_activated(
-        torch.randn(count, 3, generator=g),
-        (0.5 * torch.randn(count, 3, generator=g) - 3).exp(),
-        torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1),
-        torch.rand(count, 1, generator=g),
-        0.2 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
-    )
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -92,7 +82,7 @@ def test_ply_in_another_order_with_other_floats(tmp_path):
 
 @pytest.mark.parametrize("degree", range(4))
 def test_ply_round_trip(tmp_path, degree):
-    scene = random_scene(degree=degree)
+    scene = random_gaussians(degree=degree)
     io.save_scene(tmp_path / "scene.ply", scene)
     loaded = io.load_scene(tmp_path / "scene.ply")
     assert loaded.sh_degree == degree
@@ -110,7 +100,7 @@ def turned_by(a, b):
 
 @pytest.mark.parametrize("degree", range(4))
 def test_compressed_ply_round_trip(tmp_path, degree):
-    scene = random_scene(degree=degree)
+    scene = random_gaussians(degree=degree)
     io.save_scene(tmp_path / "scene.compressed.ply", scene)
     assert (tmp_path / "scene.compressed.ply").read_bytes().count(b"packed_position") == 1
     loaded = io.load_scene(tmp_path / "scene.compressed.ply")
@@ -133,7 +123,7 @@ def test_compressed_ply_round_trip(tmp_path, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 def test_spz_round_trip(tmp_path, degree):
-    scene = random_scene(degree=degree)
+    scene = random_gaussians(degree=degree)
     io.save_scene(tmp_path / "scene.spz", scene)
     loaded = io.load_scene(tmp_path / "scene.spz")
     assert loaded.sh_degree == degree
@@ -149,13 +139,13 @@ def test_spz_round_trip(tmp_path, degree):
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.compressed.ply", "scene.spz"])
 def test_scene_without_gaussians(tmp_path, name):
-    io.save_scene(tmp_path / name, random_scene(degree=0).rows(slice(0)))
+    io.save_scene(tmp_path / name, random_gaussians(degree=0).rows(slice(0)))
     loaded = io.load_scene(tmp_path / name)
     assert [tuple(f.shape) for f in loaded] == [(0, 3), (0, 3), (0, 4), (0, 1), (0, 1, 3)]
 
 
 def test_save_scene_keeps_opaque_gaussians_finite(tmp_path):
-    scene = random_scene(degree=0, count=3)
+    scene = random_gaussians(degree=0, count=3)
     scene = scene.with_activated(opacities=torch.tensor([[0.0], [1.0], [0.5]]))
     io.save_scene(tmp_path / "scene.ply", scene)
     loaded = io.load_scene(tmp_path / "scene.ply")
@@ -223,7 +213,7 @@ def test_scenes_with_gradients_are_saved(tmp_path):
 
 def test_save_scene_refuses_other_suffixes(tmp_path):
     with pytest.raises(io.SceneError, match=r"expected a \.ply, \.spz, \.splat, \.glb or \.gltf name, got '\.obj'"):
-        io.save_scene(tmp_path / "scene.obj", random_scene())
+        io.save_scene(tmp_path / "scene.obj", random_gaussians())
 
 
 def broken(name, write):
@@ -254,7 +244,7 @@ def with_value(tmp_path, column, value):
 
 
 def saved(tmp_path, name):
-    io.save_scene(tmp_path / name, random_scene())
+    io.save_scene(tmp_path / name, random_gaussians())
     return tmp_path / name
 
 

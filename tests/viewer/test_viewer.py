@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from capture_files import circle, write_colmap, write_pictures
+from gaussians import make_scene, make_view
 from pages import serve
 from places import ROOT
 from processes import DEADLINE
@@ -28,21 +29,6 @@ from analytic_rasterizer.viewer import pages
 
 CORE = ROOT / "csrc" / "core"
 JAVASCRIPT = (*pages.MODULES, pages.WORKER)
-
-
-def make_scene(count=30, degree=2):
-    g = torch.Generator().manual_seed(0)
-    return Gaussians.from_activated(
-        2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
-        0.3 * torch.rand(count, 3, generator=g) + 0.01,
-        torch.randn(count, 4, generator=g),
-        torch.rand(count, 1, generator=g),
-        0.5 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
-    )
-
-
-def make_view(name="front", **options):
-    return io.View(name, 64, 48, 70.0, 71.0, torch.eye(4, dtype=torch.float64), **options)
 
 
 @pytest.fixture

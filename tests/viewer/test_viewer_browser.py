@@ -26,6 +26,7 @@ from chromium import (
     wait_for_frame,
     wait_until_ready,
 )
+from gaussians import of_inputs
 from pages import (
     LARGEST,
     PATIENCE,
@@ -43,7 +44,6 @@ from places import SHARED
 import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import io, viewer
-from analytic_rasterizer.gaussians import Gaussians
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-browser")
 
@@ -118,8 +118,7 @@ def test_trained_scene(browser, name, request):
     if not (SHARED / "data" / f"{name}.npz").exists():
         pytest.skip("needs the optional ../shared scenes next to the project")
     inputs, cameras = request.getfixturevalue("plant")
-    names = ("means3D", "scales", "rotations", "opacities", "shs")
-    scene = Gaussians.from_activated(*(inputs[name].contiguous() for name in names))
+    scene = of_inputs(inputs)
     camera = cameras[0]
     w2c = torch.tensor(camera["w2c"], dtype=torch.float64).reshape(4, 4)
     view = io.View("trained", camera["width"], camera["height"], camera["fx"], camera["fy"], w2c).scaled(0.5)

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gaussians import make_scene, make_view
 from marks import needs_cuda
 from processes import DEADLINE
-from test_viewer import make_scene, make_view
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, render_stages, viewer
