@@ -13,6 +13,7 @@ import sys
 from unittest import mock
 
 import pytest
+import runs
 import torch
 import torch.distributed as dist
 import train_extra  # noqa: F401
@@ -49,10 +50,6 @@ VARIANTS = {
 CAMERAS = 2  # of the step whose gradients are compared
 
 
-def options_of(**more):
-    return TrainingOptions(**COMMON | more)
-
-
 def write_scene(folder):
     """A scene in the files of NeRF-synthetic."""
     for split, views in (("train", circle(7)), ("test", circle(4))):
@@ -62,8 +59,8 @@ def write_scene(folder):
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
-def make_run(scene, out, ranks, resume=False, memory=None, **more):
-    return training.Run(scene, out, options_of(**more), save_every=0, resume=resume, memory=memory, ranks=ranks)
+def make_run(scene, out, ranks, **given):
+    return runs.make_run(scene, out, ranks=ranks, **COMMON | given)
 
 
 def train_until(run, step):

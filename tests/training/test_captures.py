@@ -8,6 +8,7 @@ import struct
 import warnings
 from dataclasses import replace
 
+import commands
 import numpy as np
 import pytest
 import torch
@@ -296,7 +297,7 @@ def test_masks_of_nerfstudio(tmp_path):
 )
 def test_nerfstudio_cameras_with_other_lenses(tmp_path, capsys, change, message):
     write_nerfstudio(tmp_path / "scene", change)
-    assert cli.main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    assert commands.train(tmp_path / "scene", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {tmp_path / 'scene' / 'transforms.json'}: {message}") and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -342,7 +343,7 @@ def test_metadata_with_other_things_than_numbers(tmp_path, capsys, key, value, m
     rows = {"file_path": ["train/a.png"], "cam2world": [pose], "width": [32.0], "height": [32.0], "focal": [36.0]}
     metadata = {"train": rows | {key: [value]}, "test": rows}
     (tmp_path / "metadata.json").write_text(json.dumps(metadata))
-    assert cli.main(["train", str(tmp_path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    assert commands.train(tmp_path, tmp_path / "out") == 2
     assert capsys.readouterr().err == f"error: {tmp_path / 'metadata.json'}: {message}\n"
 
 
@@ -1007,9 +1008,7 @@ def test_files_of_a_far_training_have_one_frame(tmp_path, capsys):
         write_pictures(tmp_path / name / "images", circle(9, SIZE), opaque=True)
         out = tmp_path / f"{name}_out"
         assert train(tmp_path / name, out, "--iterations", "30") == 0
-        assert (
-            cli.main(["evaluate", str(out), "--lpips", "none", "--pictures", "0", "--data", str(tmp_path / name)]) == 0
-        )
+        assert commands.evaluate(out, "--data", tmp_path / name) == 0
         scenes[name] = io.load_scene(out / files.SCENE), io.load_views(out / files.CAMERAS)
         result = json.loads((out / "evaluation.json").read_text())["results"]["moment:samples=4"]["mean"]["psnr"]
         scenes[name] += (result,)
@@ -1074,7 +1073,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     said = notes_of(capsys.readouterr().err)
     assert len(said) == 2 and re.search(EXACT % "perspective", said[0])
     assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
-    assert cli.main(["evaluate", str(tmp_path / "kept"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert commands.evaluate(tmp_path / "kept") == 0
     assert json.loads((tmp_path / "kept" / "evaluation.json").read_text())["resampled"] == 0
     assert re.search(EXACT % "perspective", capsys.readouterr().err)
     options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
@@ -1082,7 +1081,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     said = notes_of(capsys.readouterr().err)
     assert len(said) == 2 and re.search(RESAMPLED % "perspective", said[0])
     assert said[1] == "no points in the capture: starts from 50 random ones in the views (--points)"
-    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert commands.evaluate(tmp_path / "out") == 0
     assert re.search(RESAMPLED % "perspective", capsys.readouterr().err)
     assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["resampled"] == 2
     options = ["--lens", "refuse", "--random-points", "50"]

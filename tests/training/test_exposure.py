@@ -1,11 +1,14 @@
 """Colour corrections of photographs: what they are, and what they bring where exposure varies."""
 
 import copy
+import functools
 import json
 import math
 
+import commands
 import numpy as np
 import pytest
+import runs
 import torch
 from capture_files import circle, draw_picture, write_nerf_synthetic
 from cli_extra import image
@@ -119,11 +122,8 @@ def uneven(tmp_path):
     return folder
 
 
-def run_of(folder, out, **options):
-    known = {"iterations": 200, "random_points": 300, "density": "none", "background": "black"}
-    run = training.Run(folder, out, training.TrainingOptions(**(known | options)))
-    run.train()
-    return run
+KNOWN = {"iterations": 200, "random_points": 300, "density": "none", "background": "black"}
+run_of = functools.partial(runs.trained, **KNOWN)
 
 
 @pytest.mark.parametrize("options", [{}, {"scales": (1, 2), "pictures_per_step": 40, "supersampling": 2}], ids=str)
@@ -148,9 +148,7 @@ def test_uneven_exposure_is_learned(uneven, tmp_path):
 
 def test_a_resumed_training_has_the_same_bits(uneven, tmp_path):
     run_of(uneven, tmp_path / "whole", iterations=60, exposure="affine")
-    run = training.Run(uneven, tmp_path / "parts", training.TrainingOptions(
-        iterations=60, random_points=300, density="none", background="black", exposure="affine"
-    ))  # fmt: skip
+    run = runs.make_run(uneven, tmp_path / "parts", **KNOWN | {"iterations": 60, "exposure": "affine"})
     for _ in range(25):
         run.trainer.step()
     run.save()
@@ -165,7 +163,7 @@ def test_the_command(uneven, tmp_path, capsys):
     given = ["train", str(uneven), "--out", out, "--iterations", "3", "--device", "cpu", "--exposure", "affine"]
     assert cli.main(given) == 0
     assert "after the best affine colour of each picture: PSNR" in capsys.readouterr().out
-    assert cli.main(["evaluate", out, "--lpips", "none", "--pictures", "0"]) == 0
+    assert commands.evaluate(out) == 0
     assert "PSNR, best affine colour" in capsys.readouterr().out
     assert cli.main([*given[:-1], "curve"]) == 2
     assert "exposure" in capsys.readouterr().err

@@ -1,9 +1,12 @@
 """Masks: pixels that do not count teach nothing, and are not measured."""
 
+import functools
 import json
 
+import commands
 import numpy as np
 import pytest
+import runs
 import torch
 from capture_files import circle, draw_picture, write_colmap
 from cli_extra import image
@@ -42,11 +45,7 @@ def wild(shape):
     return np.random.default_rng(1).integers(0, 256, shape, np.uint8)
 
 
-def run_of(folder, out, *, lens=None, **options):
-    options = {"iterations": 60, "densify_every": 20, "densify_from": 10, "max_gaussians": 200, **options}
-    run = training.Run(folder, out, training.TrainingOptions(**options), lens=lens)
-    run.train()
-    return run
+run_of = functools.partial(runs.trained, iterations=60, densify_every=20, densify_from=10, max_gaussians=200)
 
 
 @pytest.mark.parametrize(
@@ -156,10 +155,7 @@ def test_alpha_may_be_a_mask(tmp_path):
             picture.save(folder / "images" / path.stem)
             path.unlink()
         out = tmp_path / f"{name}_out"
-        options = training.TrainingOptions(iterations=30)
-        run = training.Run(folder, out, options, alpha="mask")
-        assert run.source["alpha"] == "mask"
-        run.train()
+        assert runs.trained(folder, out, alpha="mask", iterations=30).source["alpha"] == "mask"
         written.append((out / files.SCENE).read_bytes())
         (item, *_) = training.load_capture(folder, alpha="mask").train
         loaded = training.load_pictures([item], (1,), (1.0, 1.0, 1.0), "cpu")
@@ -178,7 +174,7 @@ def test_the_command_knows_masks(tmp_path, capsys):
     said = "9 of 9 photographs have a mask, whose black pixels do not count"
     assert cli.main([*given, str(tmp_path / "auto")]) == 0
     assert said in capsys.readouterr().err
-    assert cli.main(["evaluate", str(tmp_path / "auto"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert commands.evaluate(tmp_path / "auto") == 0
     assert said in capsys.readouterr().err
     assert cli.main([*given, str(tmp_path / "none"), "--masks", "none"]) == 0
     assert said not in capsys.readouterr().err

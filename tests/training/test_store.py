@@ -1,5 +1,6 @@
 """Where pictures live changes no bit of a training; limits hold; what does not fit is said before it is read."""
 
+import functools
 import json
 import pathlib
 import threading
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import runs
 import torch
 from capture_files import circle, write_nerf_synthetic
 from marks import needs_cuda
@@ -56,11 +58,7 @@ def limit(monkeypatch, limits):
     monkeypatch.setattr(pictures, "limits_of", lambda *_: limits)
 
 
-def trained(folder, out, device="cpu", memory=None, **options):
-    chosen = TrainingOptions(**{"iterations": 30, "scales": (1, 2), "densify_every": 10, **SMALL, **options})
-    run = training.Run(folder, out, chosen, device=device, memory=memory, save_every=0)
-    assert run.train()
-    return run
+trained = functools.partial(runs.trained, iterations=30, scales=(1, 2), densify_every=10, **SMALL)
 
 
 def results(run):
@@ -477,9 +475,7 @@ def test_closed_threads_are_gone_and_start_again():
 
 def test_the_order_of_a_training_is_known_ahead(synthetic, tmp_path):
     """Each step of a process asks for the pictures of its own that come next, across passes."""
-    run = training.Run(
-        synthetic, tmp_path / "out", TrainingOptions(scales=(1, 2), **SMALL), memory=PictureMemory(host=0)
-    )
+    run = runs.make_run(synthetic, tmp_path / "out", memory=PictureMemory(host=0), scales=(1, 2), **SMALL)
     trainer = run.trainer
     assert trainer.pictures.horizon == trainer.pictures.store.plan.ahead
     told = []
@@ -514,9 +510,7 @@ def test_passes_are_those_of_any_order_of_questions():
 def test_a_picture_that_breaks_during_a_training_ends_it_with_its_name(tmp_path):
     views = circle(5)
     write_nerf_synthetic(tmp_path / "scene", views[:4], views[4:])
-    run = training.Run(
-        tmp_path / "scene", tmp_path / "out", TrainingOptions(**SMALL), memory=PictureMemory(host=0), save_every=0
-    )
+    run = runs.make_run(tmp_path / "scene", tmp_path / "out", memory=PictureMemory(host=0), **SMALL)
     (tmp_path / "scene" / "train" / "r_2.png").write_bytes(b"no picture")
     with pytest.raises(io.SceneError, match=r"r_2\.png: unreadable or cut short"):
         run.train()
@@ -524,7 +518,7 @@ def test_a_picture_that_breaks_during_a_training_ends_it_with_its_name(tmp_path)
 
 
 def test_interruption_ends_the_threads(synthetic, tmp_path, monkeypatch):
-    run = training.Run(synthetic, tmp_path / "out", TrainingOptions(**SMALL), memory=PictureMemory(host=0))
+    run = runs.make_run(synthetic, tmp_path / "out", memory=PictureMemory(host=0), **SMALL)
     step, seen = run.trainer.step, []
 
     def interrupted():

@@ -1,5 +1,6 @@
 """Training: what it reads, what it writes, that it learns, and that nothing is lost where it ends early."""
 
+import functools
 import json
 import math
 import re
@@ -11,14 +12,16 @@ import sys
 import zlib
 from dataclasses import fields, replace
 
+import commands
 import numpy as np
 import pytest
+import runs
 import torch
 from capture_files import circle, looking_at_origin, truth_gaussians, write_nerf_synthetic
 from marks import needs_cuda
 from places import ROOT
 from processes import DEADLINE
-from runs import TINY, rows_shown, scatter
+from runs import rows_shown, scatter
 from train_extra import image
 from training_step import TOLERANCE, check_next_step
 
@@ -214,9 +217,7 @@ def test_help_of_train_says_what_values_are(capsys):
 # ------------------------------------------------------------------------------------ training
 
 
-def make_run(folder, out, device="cpu", resume=False, **options) -> training.Run:
-    chosen = TrainingOptions(**{"iterations": 120, "scales": (1, 2), **TINY, **options})
-    return training.Run(folder, out, chosen, device=device, images="photographs", save_every=0, resume=resume)
+make_run = functools.partial(runs.make_run, images="photographs", iterations=120, scales=(1, 2), **runs.TINY)
 
 
 @pytest.mark.parametrize(
@@ -724,7 +725,7 @@ def test_a_loss_that_is_not_finite_ends_with_an_error(synthetic, tmp_path, capsy
     monkeypatch.setattr(training.trainer, "_picture_gradients", without_loss)
     with pytest.raises(FloatingPointError, match=r"the loss of step 4 is nan"):
         run.train()
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    assert commands.train(synthetic, tmp_path, "--resume") == 2
     assert capsys.readouterr().err.endswith("error: the loss of step 4 is nan; lower learning rates may help\n")
     assert files.read_checkpoint(tmp_path / files.CHECKPOINT)["progress"]["step"] == 3
 
@@ -732,7 +733,7 @@ def test_a_loss_that_is_not_finite_ends_with_an_error(synthetic, tmp_path, capsy
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04K\x01."])
 def test_a_broken_checkpoint_is_one_line(synthetic, tmp_path, capsys, content):
     (tmp_path / files.CHECKPOINT).write_bytes(content)
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    assert commands.train(synthetic, tmp_path, "--resume") == 2
     error = capsys.readouterr().err
     assert "checkpoint.pt: " in error and error.startswith("error: ") and error.count("\n") == 1
 
@@ -985,7 +986,7 @@ def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
     shutil.copy(tmp_path / "scene" / "train" / "r_0.png", tmp_path / "scene" / "test" / "seen.png")
     arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]
     assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--random-points", "50"]) == 0
-    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert commands.evaluate(tmp_path / "out") == 0
     metrics = json.loads((tmp_path / "out" / files.METRICS).read_text(), parse_constant=refuse_constant)
     evaluation = (tmp_path / "out" / "evaluation.json").read_text()
     of_evaluation = json.loads(evaluation, parse_constant=refuse_constant)["results"]["moment:samples=4"]

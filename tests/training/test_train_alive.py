@@ -1,12 +1,15 @@
 """Trainings do not die in silence: captures that are hard train, and what is left of a training can be read."""
 
+import functools
 import json
 import math
 import re
 import shutil
 from dataclasses import replace
 
+import commands
 import pytest
+import runs
 import torch
 from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
 from train_extra import image
@@ -40,9 +43,7 @@ def orbit(tmp_path_factory):
     return write_capture(tmp_path_factory.mktemp("orbit"), circle(10))
 
 
-def make_run(folder, out, **options):
-    chosen = TrainingOptions(**{"iterations": 200, "densify_from": 20, "densify_every": 20, **QUICK, **options})
-    return training.Run(folder, out, chosen, save_every=0)
+make_run = functools.partial(runs.make_run, iterations=200, densify_from=20, densify_every=20, **QUICK)
 
 
 # ------------------------------------------------------------------- the extent, and cameras
@@ -162,7 +163,7 @@ def test_cameras_at_one_place_train(tmp_path, baseline, points):
 
 def test_cameras_with_one_pose_are_refused(tmp_path, capsys):
     folder = write_capture(tmp_path / "scene", [replace(circle(3)[1], name=f"r_{i}") for i in range(4)])
-    assert cli.main(["train", str(folder), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    assert commands.train(folder, tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "got all 3 at one place in one direction" in error
     assert not (tmp_path / "out").exists()
@@ -258,7 +259,7 @@ def test_most_gaussians_outside_of_float32_end_the_training(orbit, tmp_path, cap
             break_rows(trainer, "means", slice(50, None))
 
     monkeypatch.setattr(training.Trainer, "step", breaking)
-    assert cli.main(["train", str(orbit), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    assert commands.train(orbit, tmp_path, "--resume") == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ") and "Gaussians have means outside of float32 by step 80" in error
     assert error.endswith("the training diverges; a lower --means-rate may help")

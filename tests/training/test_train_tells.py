@@ -1,10 +1,13 @@
 """What a training says, on the screen, in its log and for TensorBoard; when it does what; for how long it goes on."""
 
+import functools
 import json
 import re
 import sys
 
+import commands
 import pytest
+import runs
 import torch
 import train_extra  # noqa: F401
 from capture_files import circle, write_nerf_synthetic
@@ -26,13 +29,11 @@ def scene(tmp_path_factory):
 
 
 def train(scene, out, *options) -> int:
-    return cli.main(["train", str(scene), "--out", str(out), "--device", "cpu", *TINY, *map(str, options)])
+    return commands.train(scene, out, *TINY, *map(str, options))
 
 
-def make_run(scene, out, resume=False, more=None, **options):
-    usual = {"random_points": 60, "sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300}
-    chosen = TrainingOptions(**usual | options)
-    return training.Run(scene, out, chosen, save_every=0, resume=resume, **more or {})
+USUAL = {"random_points": 60, "sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300}
+make_run = functools.partial(runs.make_run, **USUAL)
 
 
 def log_of(out) -> list[dict]:
