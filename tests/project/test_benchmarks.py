@@ -18,6 +18,7 @@ import pages
 import pytest
 import scenes
 import torch
+import wall
 from capture_files import circle, write_nerf_synthetic
 from places import ROOT
 from processes import DEADLINE, python_path
@@ -959,8 +960,8 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     training = importlib.import_module("analytic_rasterizer.training")
-    test_plan, effects = (importlib.import_module(name) for name in ("test_plan", "capture_effects"))
-    test_plan.write_wall(tmp_path / "wall")
+    effects = importlib.import_module("capture_effects")
+    wall.write_wall(tmp_path / "wall")
     options = ["--iterations", "2", "--device", "cpu", "--stops", "0.8", "--balance", "0", "--footprints", "box"]
     arguments = ["capture_effects.py", str(tmp_path / "wall"), "--out", str(tmp_path / "out"), *options]
     monkeypatch.setattr(sys, "argv", arguments)

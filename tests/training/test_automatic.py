@@ -9,7 +9,7 @@ import pytest
 import torch
 import train_extra  # noqa: F401
 from capture_files import circle, write_nerf_synthetic
-from test_plan import cameras, write_wall
+from wall import cameras, write_wall
 
 from analytic_rasterizer import cli, io, training
 from analytic_rasterizer.distributed.ranks import Ranks
