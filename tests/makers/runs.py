@@ -8,19 +8,19 @@ from analytic_rasterizer.training import Run, TrainingOptions
 from analytic_rasterizer.training import model as g
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
-OF_RUN = inspect.signature(Run).parameters.keys() - {"iterations", "seconds"}
+OF_RUN = inspect.signature(Run).parameters.keys() - {"device", "iterations", "seconds"}
 
 
-def make_run(folder, out, more=None, **given) -> Run:
+def make_run(folder, out, device="cpu", *, more=None, **given) -> Run:
     """A training that saves nothing before its end. `given` are its options, and arguments of `Run` with other names
     than options; `more` are further ones of `Run`."""
     of_run = {name: given.pop(name) for name in OF_RUN & given.keys()}
-    return Run(folder, out, TrainingOptions(**given), **{"save_every": 0} | of_run | (more or {}))
+    return Run(folder, out, TrainingOptions(**given), device=device, **{"save_every": 0} | of_run | (more or {}))
 
 
-def trained(folder, out, **given) -> Run:
+def trained(folder, out, device="cpu", **given) -> Run:
     """A training that has ended."""
-    run = make_run(folder, out, **given)
+    run = make_run(folder, out, device, **given)
     assert run.train()
     return run
 

@@ -31,10 +31,27 @@ from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.gaussians import Gaussians
 
 
-@pytest.fixture
-def small_scene(tmp_path, monkeypatch):
-    """Files of a scene and of views; benchmarks/ can be imported from."""
+@pytest.fixture(autouse=True)
+def imports_of_benchmarks(monkeypatch):
+    """benchmarks/ can be imported from."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """A function that runs a program with arguments, and returns what it printed."""
+
+    def run(program, *arguments):
+        monkeypatch.setattr(sys, "argv", [f"{program.__name__}.py", *map(str, arguments)])
+        program.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
+def small_scene(tmp_path):
+    """Files of a scene and of views."""
     made = scenes.cast(scenes.random_scene(3, 50, degree=1), torch.float32)
     fields = {"means": made["means3D"], **{k: made[k] for k in ("scales", "rotations", "opacities", "shs")}}
     importlib.import_module("scene_files").save_npz(tmp_path / "scene.npz", Gaussians.from_activated(**fields))
@@ -43,14 +60,15 @@ def small_scene(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_effects(device, small_scene, monkeypatch, capsys):
+def files_of(folder):
+    return [folder / "scene.npz", "--views", folder / "views.json", "--json", folder / "out.json"]
+
+
+def test_effects(device, small_scene, run):
     """Every row, with numbers in all of its columns."""
     effects = importlib.import_module("effects")
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--footprints", "box:samples=4", "--rounds", "1", "--scales", "2", "--threads", "1", "--device", device]
-    monkeypatch.setattr(sys, "argv", ["effects.py", *map(str, arguments), *options])
-    effects.main()
-    table = capsys.readouterr().out
+    table = run(effects, *files_of(small_scene), *options)
     results = json.loads((small_scene / "out.json").read_text())["results"]["box:samples=4"]
     assert list(results) == list(effects.ROWS)
     for name, result in results.items():
@@ -63,7 +81,6 @@ def test_effects(device, small_scene, monkeypatch, capsys):
 def test_footprint_figure(tmp_path, monkeypatch):
     """It is drawn, and what it draws of moving samples is what the library blends (the program compares)."""
     pytest.importorskip("matplotlib", reason="needs the analysis extra")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     figure = importlib.import_module("footprint_figure")
     monkeypatch.setattr(sys, "argv", ["footprint_figure.py", "--out", str(tmp_path / "out.png")])
     figure.main()
@@ -73,13 +90,10 @@ def test_footprint_figure(tmp_path, monkeypatch):
     assert (moment - truth).abs().max() < 0.02 < (one_weight - truth).abs().max()
 
 
-def test_dialects(monkeypatch, capsys):
+def test_dialects(run):
     """A row for every dialect, and both calls of each make the same images."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     benchmark = importlib.import_module("dialects")
-    monkeypatch.setattr(sys, "argv", ["dialects.py", "--rounds", "2"])
-    benchmark.main()
-    rows = capsys.readouterr().out.splitlines()[4:]
+    rows = run(benchmark, "--rounds", "2").splitlines()[4:]
     assert [row.split()[1] for row in rows] == list(DIALECTS)
     assert all(float(cell) < math.inf for row in rows for cell in row.strip("|").split("|")[1:])
     for name in DIALECTS:
@@ -92,15 +106,12 @@ def test_dialects(monkeypatch, capsys):
             assert name == "luiten" or all(any(torch.equal(image, value) for value in own) for image in made)
 
 
-def test_speed(device, small_scene, monkeypatch, capsys):
+def test_speed(device, small_scene, run):
     """A row for every footprint, with numbers in all of its columns."""
     speed = importlib.import_module("speed")
     footprints = ["box:samples=1", "mip", "mip@2"]
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--rounds", "1", "--queued", "--sh-degree", "2", "--threads", "1", "--device", device]
-    monkeypatch.setattr(sys, "argv", ["speed.py", *map(str, arguments), *options, "--footprints", *footprints])
-    speed.main()
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(speed, *files_of(small_scene), *options, "--footprints", *footprints).splitlines()
     assert "50 Gaussians of SH degree 2, 2 views of 40x30" in lines[0]
     assert [line.split()[0] for line in lines[2:5]] == footprints
     written = json.loads((small_scene / "out.json").read_text())
@@ -124,16 +135,14 @@ def check_doors(text, doors, path, rows):
     return results
 
 
-def test_doors(device, small_scene, monkeypatch, capsys):
+def test_doors(device, small_scene, monkeypatch, run):
     """Every row, beside gsplat where it is; calls with the same options make the same images."""
     doors = importlib.import_module("doors")
     calls = add_peers(monkeypatch)
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--rounds", "1", "--threads", "1", "--limit-views", "1", "--scales", "2", "--device", device]
-    monkeypatch.setattr(sys, "argv", ["doors.py", *map(str, arguments), *options])
-    doors.main()
+    printed = run(doors, *files_of(small_scene), *options)
     rows = [*doors.DOORS, *doors.PEERS]
-    results = check_doors(capsys.readouterr().out, doors, small_scene / "out.json", rows)
+    results = check_doors(printed, doors, small_scene / "out.json", rows)
     assert device == "cpu" or all(result["events_forward"] > 0 for result in results.values())
     for options in doors.CALLS.values():  # gsplat's own function was called with the options of each row
         wanted = {name: value for name, value in options.items() if name not in ("cameras", "coefficients")}
@@ -142,13 +151,11 @@ def test_doors(device, small_scene, monkeypatch, capsys):
         assert any(len(kwargs["Ks"]) == options.get("cameras", 1) for kwargs in found)
 
 
-def test_doors_of_a_tiny_scene(small_scene, monkeypatch, capsys):
+def test_doors_of_a_tiny_scene(small_scene, monkeypatch, capsys, run):
     """Needs no files, and rows that others are compared with are there too."""
     doors = importlib.import_module("doors")
     options = ["--tiny", "--rounds", "2", "--doors", "defocus", "gsplat", "--json", str(small_scene / "out.json")]
-    monkeypatch.setattr(sys, "argv", ["doors.py", *options])
-    doors.main()
-    out = capsys.readouterr().out
+    out = run(doors, *options)
     assert "10 Gaussians of SH degree 1, 1 views of 32x32" in out and ", 1 threads," in out
     check_doors(out, doors, small_scene / "out.json", ["plain", "plain, as defocus", "defocus", "gsplat"])
     monkeypatch.setattr(sys, "argv", ["doors.py", "scene.ply", *options])
@@ -211,16 +218,13 @@ def add_peers(monkeypatch):
     return calls
 
 
-def test_speed_against(device, small_scene, monkeypatch, capsys):
+def test_speed_against(device, small_scene, monkeypatch, run):
     """A row for every peer that is there, whose picture is ours of the same footprint; the others are named."""
     speed = importlib.import_module("speed")
     calls = add_peers(monkeypatch)
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     names = ["gsplat", "gsplat_antialiased", "official", "module:official=mip", "not_there"]
     options = ["--rounds", "1", "--threads", "1", "--device", device, "--footprints", "box:samples=1"]
-    monkeypatch.setattr(sys, "argv", ["speed.py", *map(str, arguments), *options, "--against", ",".join(names)])
-    speed.main()
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(speed, *files_of(small_scene), *options, "--against", ",".join(names)).splitlines()
     assert lines[0].startswith("not_there: left out, for it is not installed")
     assert [line.split()[0] for line in lines[3:8]] == ["box:samples=1", *names[:-1]]
     results = json.loads((small_scene / "out.json").read_text())["results"]
@@ -269,16 +273,14 @@ def test_peers_that_need_cuda_are_left_out_without(small_scene, monkeypatch, cap
     assert list(peers.find_peers(["gsplat", "official"], "cuda")) == ["gsplat", "official"]
 
 
-def test_table(device, small_scene, monkeypatch, capsys):
+def test_table(device, small_scene, monkeypatch, capsys, run):
     """A column for every scene, a row for every footprint and peer."""
     table = importlib.import_module("table")
     add_peers(monkeypatch)
     columns = [f"{label}={small_scene}/scene.npz,{small_scene}/views.json" for label in ("first", "second one")]
     options = ["--rounds", "1", "--threads", "1", "--device", device, "--against", "official"]
     arguments = [*columns, *options, "--footprints", "mip", "analytic", "--json", str(small_scene / "out.json")]
-    monkeypatch.setattr(sys, "argv", ["table.py", *arguments])
-    table.main()
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(table, *arguments).splitlines()
     results = json.loads((small_scene / "out.json").read_text())["results"]
     assert lines[2] == "| forward / forward + backward, ms | first | second one |"
     for line, name in zip(lines[4:7], ("mip", "analytic", "official"), strict=True):
@@ -297,7 +299,6 @@ def test_table(device, small_scene, monkeypatch, capsys):
 
 def run_scaling(monkeypatch, device, folder, *options):
     """What scaling.py writes for 100 and 400 Gaussians and for three sizes."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     scaling = importlib.import_module("scaling")
     given = ["--gaussians", "1e2,4e2", "--size", "96x64", "--sizes", "48x32,96x64,192x128", "--rounds", "1"]
     given += ["--density", "0.05", "--count", "200", "--device", device, "--json", str(folder / "out.json"), *options]
@@ -327,7 +328,6 @@ def test_scaling(device, tmp_path, monkeypatch, capsys):
 
 def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatch, capsys):
     """A row, not the end of the program; any other error ends it."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     scaling = importlib.import_module("scaling")
     original = scaling.make_case
 
@@ -366,9 +366,8 @@ def test_scaling_with_threads(tmp_path, monkeypatch, capsys):
     assert {path.name for path in (tmp_path / "figures").iterdir()} >= {"scaling.png", "threads.png", "threads.svg"}
 
 
-def test_synthetic_splats_keep_their_size(monkeypatch):
+def test_synthetic_splats_keep_their_size():
     """In px, whatever the image; so every Gaussian has as many pairs, and none is culled."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     scaling = importlib.import_module("scaling")
     for width, height in ((240, 135), (960, 540)):
         view = io.View("", width, height, 4.0 * width, 4.0 * width, torch.eye(4, dtype=torch.float64))
@@ -385,14 +384,11 @@ def test_synthetic_splats_keep_their_size(monkeypatch):
         assert (splats.means2d.amax(0) > 0.95 * torch.tensor([width, height])).all()
 
 
-def test_losses(device, tmp_path, monkeypatch, capsys):
+def test_losses(device, tmp_path, run):
     """Every row, with a time in all of its columns."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     losses = importlib.import_module("losses")
     options = ["--sizes", "20x10", "--gaussians", "30", "--rounds", "1", "--threads", "1", "--device", device]
-    monkeypatch.setattr(sys, "argv", ["losses.py", *options, "--json", str(tmp_path / "out.json")])
-    losses.main()
-    table = capsys.readouterr().out
+    table = run(losses, *options, "--json", str(tmp_path / "out.json"))
     results = json.loads((tmp_path / "out.json").read_text())["results"]
     assert len(results) == 11
     for name, result in results.items():
@@ -401,9 +397,8 @@ def test_losses(device, tmp_path, monkeypatch, capsys):
         assert all(0 < value < math.inf for value in times)
 
 
-def test_busy(tmp_path, monkeypatch, capsys):
+def test_busy(tmp_path, monkeypatch, run):
     """Rows alone and beside loops, with one thread and with two in turn; no loop is left, and torch's setting stays."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     busy = importlib.import_module("busy")
     started, asked, alive = [], [], []
 
@@ -418,9 +413,7 @@ def test_busy(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(busy, "subprocess", types.SimpleNamespace(Popen=start, PIPE=subprocess.PIPE))
     monkeypatch.setattr(torch, "set_num_threads", ask)
     options = ["--loops", "2", "--threads", "2", "--gaussians", "30", "--sizes", "20x10", "--rounds", "1"]
-    monkeypatch.setattr(sys, "argv", ["busy.py", *options, "--json", str(tmp_path / "out.json")])
-    busy.main()
-    table = capsys.readouterr().out
+    table = run(busy, *options, "--json", str(tmp_path / "out.json"))
     rows = json.loads((tmp_path / "out.json").read_text())["results"]
     assert [(row["pass"], row["loops"]) for row in rows] == [
         (name, loops) for loops in (0, 2) for name in ("forward", "with backward")
@@ -437,7 +430,6 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     """A row for every variant, and a run for every variant and seed, on pictures of noise."""
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
     pytest.importorskip("scipy", reason="needs the train extra")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     training = importlib.import_module("training")
     pixels = torch.randint(256, (16, 16, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
     image.fromarray(pixels).save(tmp_path / "a.png")
@@ -473,7 +465,6 @@ def test_training(device, tmp_path, monkeypatch, capsys):
 
 def test_gsplat_training(tmp_path, monkeypatch, capsys):
     """Its strategy grows Gaussians from our call, and the error of the pictures falls; what is missing is said."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     program = importlib.import_module("gsplat_training")
     arguments = [str(tmp_path), "--device", "cpu", "--random-points", "300", "--json", str(tmp_path / "out.json")]
     monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments])
@@ -490,7 +481,7 @@ def test_gsplat_training(tmp_path, monkeypatch, capsys):
     found = {}
     for steps, options in ((1, []), (60, []), (20, ["--packed", "--absgrad", "--antialiased"])):
         options = [*options, "--iterations", str(steps), "--refine-start", "5", "--refine-every", "10"]
-        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, *options])
+        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *files_of(small_scene), *options])
         assert program.main() == 0
         [header, row] = capsys.readouterr().out.splitlines()[1:]
         assert header.split()[:4] == ["rasterizer", "seconds", "PSNR", "Gaussians"] and row.split()[0] == "ours"
@@ -500,10 +491,9 @@ def test_gsplat_training(tmp_path, monkeypatch, capsys):
 
 def run_on_ranks(name, small_scene, *options):
     """What a benchmark prints and writes that starts one process, and then two."""
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--ranks", "1", "2", "--rounds", "2", "--threads", "1", "--device", "cpu", *options]
     done = subprocess.run(
-        [sys.executable, ROOT / "benchmarks" / name, *map(str, arguments), *options],
+        [sys.executable, ROOT / "benchmarks" / name, *map(str, files_of(small_scene)), *options],
         cwd=small_scene, capture_output=True, text=True, timeout=DEADLINE,
         env=os.environ | {"PYTHONPATH": python_path()},
     )  # fmt: skip
@@ -555,15 +545,12 @@ def test_bands_say_what_does_not_fit_whichever_rank_is_heard_of(small_scene, mon
         raise_of_rank("RuntimeError: something else")
 
 
-def test_formats(small_scene, monkeypatch, capsys):
+def test_formats(small_scene, run):
     """A row for every format and for the file of another program; what rounds less shows less."""
     benchmark, scene_files = importlib.import_module("formats"), importlib.import_module("scene_files")
     io.save_scene(small_scene / "other.ply", scene_files.load_scene(small_scene / "scene.npz"))
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--also", str(small_scene / "other.ply"), "--device", "cpu", "--footprint", "box:samples=1"]
-    monkeypatch.setattr(sys, "argv", ["formats.py", *map(str, arguments), *options])
-    benchmark.main()
-    table = capsys.readouterr().out
+    table = run(benchmark, *files_of(small_scene), *options)
     results = {row["file"]: row for row in json.loads((small_scene / "out.json").read_text())["results"]}
     assert list(results) == [*(f"scene.{suffix}" for suffix in benchmark.FORMATS), "other.ply"]
     assert all(f"| {name.removeprefix('scene')} |" in table for name in results)
@@ -572,14 +559,11 @@ def test_formats(small_scene, monkeypatch, capsys):
     assert results["scene.glb"]["rotations"][0] < 1e-4 < 0.01 < results["scene.spz"]["rotations"][0] < 0.3
 
 
-def test_approximations(small_scene, monkeypatch, capsys):
+def test_approximations(small_scene, run):
     """The program's first picture is the library's, and what is approximated changes it (no ray of it is dark)."""
     benchmark = importlib.import_module("approximations")
-    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
     options = ["--scales", "1", "--crop", "24", "20", "--samples", "2", "--limit-views", "1", "--threads", "1"]
-    monkeypatch.setattr(sys, "argv", ["approximations.py", *map(str, arguments), *options])
-    benchmark.main()
-    assert "| a | 1/1 |" in capsys.readouterr().out
+    assert "| a | 1/1 |" in run(benchmark, *files_of(small_scene), *options)
     [result] = json.loads((small_scene / "out.json").read_text())["results"]
     # One of the 1920 samples on the other side of a threshold by rounding: 1/255/4 in one of 480 pixels.
     assert result["library"] > -20 * math.log10(1 / 255 / 4 / math.sqrt(480))
@@ -638,7 +622,7 @@ def test_order_of_each_ray(small_scene):
     assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])
 
 
-def test_lens_accuracy(tmp_path, small_scene, monkeypatch, capsys):
+def test_lens_accuracy(tmp_path, small_scene, monkeypatch, run):
     """Rows with numbers; the library's samples are the program's; pictures; the number predicts errors of weights."""
     benchmark = importlib.import_module("lens_accuracy")
     sizes = ["--size", "24", "16", "--samples", "2", "--gaussians", "60", "--threads", "1", "--fovs", "90", "150"]
@@ -654,9 +638,7 @@ def test_lens_accuracy(tmp_path, small_scene, monkeypatch, capsys):
     assert sum(row[kind][0] for row in results["weights"] for kind in benchmark.CAMERAS if kind in row) <= 180
     assert (tmp_path / "out" / "fisheye_150_2_affine_x10.png").exists()
     files = [str(small_scene / "scene.npz"), "--views", str(small_scene / "views.json"), "--fovs", "100"]
-    monkeypatch.setattr(sys, "argv", ["lens_accuracy.py", *files, *sizes[:-3]])
-    benchmark.main()
-    assert "| fisheye | 100 | the scene |" in capsys.readouterr().out
+    assert "| fisheye | 100 | the scene |" in run(benchmark, *files, *sizes[:-3])
 
 
 def test_lens_accuracy_approximates_what_the_library_renders(small_scene):
@@ -741,18 +723,7 @@ def test_timeline(small_scene, monkeypatch, capsys):
     assert timeline.SLEEPER not in printed
 
 
-def runner(benchmark, monkeypatch, capsys):
-    """A function that runs the program with arguments, and returns what it printed."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", [f"{benchmark.__name__}.py", *map(str, arguments)])
-        benchmark.main()
-        return capsys.readouterr().out
-
-    return run
-
-
-def test_viewer_gpu(small_scene, monkeypatch, capsys):
+def test_viewer_gpu(small_scene, run):
     """The page's shaders under OpenGL draw what the rasterizer does, also from a prepared file; other pictures are
     noticed."""
     pytest.importorskip("moderngl", reason="needs moderngl")
@@ -764,14 +735,13 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    run = runner(benchmark, monkeypatch, capsys)
     shaders, job, written = (small_scene / name for name in ("shaders.json", "job.npz", "out.json"))
     given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
-    run("--write-shaders", shaders)
-    run(*given, "--shaders", shaders, "--prepare", job)
+    run(benchmark, "--write-shaders", shaders)
+    run(benchmark, *given, "--shaders", shaders, "--prepare", job)
     rounds = ["--rounds", "2", "--json", written]
     for scene in (given, [job]):
-        out = run(*scene, *rounds)
+        out = run(benchmark, *scene, *rounds)
         results = json.loads(written.read_text())
         assert list(results["differences"]) == list(pages.WEBGL_FOOTPRINTS)
         for name, of_bits in results["differences"].items():
@@ -786,11 +756,11 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
 
     prepared = benchmark.Job.load(job)
     dataclasses.replace(prepared, expected=lambda _: prepared.expected("point")).save(job, ["analytic"])
-    run(job, *rounds, "--footprints", "analytic")
+    run(benchmark, job, *rounds, "--footprints", "analytic")
     assert json.loads(written.read_text())["differences"]["analytic"]["32-bit floats"]["largest"] > 1
 
 
-def test_viewer_webgpu(small_scene, monkeypatch, capsys):
+def test_viewer_webgpu(small_scene, monkeypatch, run):
     """The page's passes in wgpu draw what the rasterizer does, also from a plan and a prepared file; other pictures are
     noticed."""
     pytest.importorskip("wgpu", reason="needs wgpu")
@@ -804,15 +774,14 @@ def test_viewer_webgpu(small_scene, monkeypatch, capsys):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    run = runner(benchmark, monkeypatch, capsys)
     plan, job, written = (small_scene / name for name in ("plan.json", "job.npz", "out.json"))
     scene = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
     names = ["analytic", "moment:samples=4", "mip:variance=0.3"]
     options = ["--footprints", *names, "--timed", "moment:samples=4", "--rounds", "2", "--repeat", "2"]
-    run(*scene, *options, "--write-plan", plan)
-    run(*scene, *options, "--plan", plan, "--prepare", job)
+    run(benchmark, *scene, *options, "--write-plan", plan)
+    run(benchmark, *scene, *options, "--plan", plan, "--prepare", job)
     for given in ([*scene, "--plan", plan], [job]):
-        out = run(*given, *options, "--json", written)
+        out = run(benchmark, *given, *options, "--json", written)
         results = json.loads(written.read_text())
         assert list(results["differences"]) == names
         for name, found in results["differences"].items():
@@ -827,12 +796,12 @@ def test_viewer_webgpu(small_scene, monkeypatch, capsys):
 
     prepared = benchmark.Job.load(job)
     dataclasses.replace(prepared, expected=lambda _: prepared.expected("mip:variance=0.3")).save(job, names)
-    run(job, *options, "--json", written)
+    run(benchmark, job, *options, "--json", written)
     assert json.loads(written.read_text())["differences"]["analytic"]["largest"] > 1
     with pytest.raises(SystemExit, match="another number of Gaussians, other views or other sizes"):
-        run(*scene[:-1], "40x30", *options, "--plan", plan)
+        run(benchmark, *scene[:-1], "40x30", *options, "--plan", plan)
     with pytest.raises(SystemExit, match="has no point at 40x30"):
-        run(*scene, *options, "--plan", plan, "--footprints", "point")
+        run(benchmark, *scene, *options, "--plan", plan, "--footprints", "point")
 
 
 def test_every_kernel(device, monkeypatch, capsys):
@@ -928,7 +897,6 @@ def test_large_capture(tmp_path, monkeypatch, capsys):
     numpy = pytest.importorskip("numpy")
     pytest.importorskip("tqdm", reason="needs the train extra")
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     monkeypatch.setenv("PYTHONPATH", python_path())
     program = importlib.import_module("large_capture")
     folder, results = tmp_path / "capture", tmp_path / "out.json"
@@ -958,7 +926,6 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
     """Copies have what their docstring says, and every training a row. The numbers mean nothing."""
     pytest.importorskip("tqdm", reason="needs the train extra")
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     training = importlib.import_module("analytic_rasterizer.training")
     effects = importlib.import_module("capture_effects")
     wall.write_wall(tmp_path / "wall")
@@ -994,7 +961,6 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
 def test_room(tmp_path, monkeypatch):
     """Its photographs show the points where the cameras say, in their colours."""
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     program = importlib.import_module("room")
     folder = tmp_path / "room"
     monkeypatch.setattr(sys, "argv", ["room.py", str(folder), "--count", "4", "--size", "60x40", "--points", "200"])
