@@ -174,7 +174,11 @@ class Trainer:
 
     def _may_change(self) -> bool:
         """Whether density control may change the number of Gaussians after this step."""
-        return self.options.density != "none" and self.progress.passed(self.density.options.densify_every)
+        if self.options.density == "none":
+            return False
+        progress, told = self.progress, self.density.options
+        grows = progress.step > told.densify_from and progress.share < told.densify_until
+        return grows and progress.passed(told.densify_every)
 
     def measure(self, elapsed: float) -> None:
         """Corrects a training by the clock by the seconds `elapsed`: the share that is over, and the times of growth.
