@@ -207,6 +207,7 @@ def effects(device: str) -> None:
     for each in (
         ar.Effects(**dict.fromkeys(names, True)),
         ar.Effects(defocus=ar.Defocus(aperture=0.1, focus=3.0), motion=motion, camera_gradients=True),
+        ar.Effects(lens=ar.Lens.equirectangular()),
     ):
         render(device, footprint="box:samples=4", effects=each)
         render(device, footprint="moment:samples=4", effects=each)
