@@ -42,7 +42,16 @@ from PIL import Image, ImageFilter
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.training import Capture, Run, TrainingOptions, evaluate, extent_of, load_capture, load_pictures
+from analytic_rasterizer.training import (
+    Capture,
+    CaptureSource,
+    Run,
+    TrainingOptions,
+    evaluate,
+    extent_of,
+    load_capture,
+    load_pictures,
+)
 from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
 from analytic_rasterizer.training.files import write_json
 
@@ -106,7 +115,7 @@ def main() -> None:
 def train(copies: Path, out: Path, row: Row, options: TrainingOptions, device: str) -> dict[str, Any]:
     """Trains and tests."""
     shutil.rmtree(out, ignore_errors=True)
-    run = Run(copies / row.copy, out, options, device=device, masks=row.masks, save_every=0)
+    run = Run(CaptureSource(copies / row.copy, masks=row.masks), out, options, device=device, save_every=0)
     run.train()
     test = load_pictures(run.capture.test, (1,), run.capture.background, device)
     found = evaluate(run.trainer.scene(), test, options.footprint, color_corrected=True)["mean"]

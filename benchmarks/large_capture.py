@@ -119,7 +119,8 @@ def train(folder: Path, place: str, args: argparse.Namespace) -> dict:
     )
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as out:
-        run = training.Run(folder, out, options, device=args.device, test_every=0, memory=memory, save_every=0)
+        source = training.CaptureSource(folder, test_every=0)
+        run = training.Run(source, out, options, device=args.device, memory=memory, save_every=0)
         loaded = time.perf_counter() - began
         pictures, trainer = run.trainer.pictures, run.trainer
         counted, seconds, slowest, losses = Counted(pictures.store), 0.0, 0.0, []

@@ -207,7 +207,7 @@ def main() -> None:
                 effects="none",
             )
             out = args.out / f"{name}_{lens}_{seed}"
-            run = training.Run(args.out / name, out, options, device=args.device, lens=lens)
+            run = training.Run(training.CaptureSource(args.out / name, lens=lens), out, options, device=args.device)
             run.train()
             results.setdefault(f"{name}, {lens}", []).append(run.evaluate()["test"]["mean"]["psnr"])
     print("| photographs | PSNR of held-out pinholes, dB |\n|---|---|")

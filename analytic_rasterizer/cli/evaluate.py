@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .. import io
 from ..analysis.tables import format_table
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
-from ..training import PictureMemory, TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
-from ..training.captures import CHOICES, IMAGES, TEST_PERIOD, Capture
+from ..training import (
+    CaptureSource,
+    PictureMemory,
+    TrainingOptions,
+    evaluate,
+    load_lpips,
+    load_pictures,
+    save_pictures,
+)
+from ..training.captures import IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
@@ -80,11 +89,8 @@ def run(args) -> None:
 class Protocol(NamedTuple):
     """What a scene is compared with, and how."""
 
-    data: str  # folder of the capture
-    images: str
-    test_every: int
+    source: CaptureSource  # settled
     scales: tuple[int, ...]
-    reading: dict[str, Any]  # further arguments of load_capture
     options: TrainingOptions | None  # of the training, where it was one of this package
 
 
@@ -97,10 +103,9 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     """
     if found.options is not None:
         try:
-            source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-            reading = {name: source[name] for name in ("cameras", *CHOICES) if name in source}
-            named = source["scene"], source["images"], source["test_every"]
-            usual = Protocol(*named, options.scales, reading, options)
+            source = CaptureSource.from_dict(found.options["source"])
+            options = TrainingOptions.from_dict(found.options["options"])
+            scales = options.scales
         except (ValueError, KeyError, TypeError) as error:
             raise io.SceneError(f"{found.path.parent / OPTIONS}: not what `train` writes ({error})") from None
     else:
@@ -111,10 +116,10 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
             raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
         named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
         images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
-        usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), {}, None)
-    given = {name: getattr(args, name) for name in ("data", "images", "test_every", "scales")}
-    chosen = usual._replace(**{name: value for name, value in given.items() if value is not None})
-    return chosen._replace(scales=tuple(dict.fromkeys(chosen.scales)))
+        source, options, scales = CaptureSource(args.data, images), None, scales_of(cfg_args, args.images or images)
+    given = {"folder": args.data, "images": args.images, "test_every": args.test_every}
+    source = replace(source, **{name: value for name, value in given.items() if value is not None})
+    return Protocol(source.settled(), tuple(dict.fromkeys(args.scales or scales)), options)
 
 
 def scales_of(cfg_args: CfgArgs, images: str) -> tuple[int, ...]:
@@ -133,13 +138,15 @@ def run_on(ranks: Ranks, args) -> None:
     check_scales(protocol.scales)  # raises before the capture is read
     choices = [found.choose_footprint(name) for name in args.footprints or [None]]
     offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
-    capture = load_capture(protocol.data, protocol.images, protocol.test_every, **protocol.reading, offset=offset)
+    capture = protocol.source.load(offset=offset)
     if not capture.test:
-        raise io.SceneError(f"{protocol.data}: there are no test pictures")
+        raise io.SceneError(f"{protocol.source.folder}: there are no test pictures")
     background = background_for(found, protocol, capture, args.background)
     scene = part_of(io.load_scene(found.path), ranks).to(args.device)
     if not seen_distance([item.view for item in capture.test], scene.means.cpu()):
-        tell(f"warning: no test picture shows any Gaussian of {found.path}: was it trained on {protocol.data}?")
+        tell(
+            f"warning: no test picture shows any Gaussian of {found.path}: was it trained on {protocol.source.folder}?"
+        )
     memory = PictureMemory(processes=processes_here(ranks))
     pictures = load_pictures(capture.test, protocol.scales, background, args.device, options.downsampling, memory)
     said = [] if protocol.options else differences(found, protocol, capture, background)
@@ -162,7 +169,7 @@ def run_on(ranks: Ranks, args) -> None:
             save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
         views = [view.name for view in pictures.views]
-        written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
+        written = {"scene": str(found.path), "data": str(protocol.source.folder), "views": views}
         written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
@@ -181,7 +188,7 @@ def background_for(found: io.FoundScene, protocol: Protocol, capture: Capture, g
 def differences(found: io.FoundScene, protocol: Protocol, capture: Capture, background) -> list[str]:
     """How a scene that was trained elsewhere is tested, and where that may differ from its training, in lines."""
     said = [
-        f"{found.path}: {len(capture.test)} test pictures of {protocol.data}, reduced by "
+        f"{found.path}: {len(capture.test)} test pictures of {protocol.source.folder}, reduced by "
         f"{', '.join(map(str, protocol.scales))}; background {color_in_words(background)}"
     ]
     if found.cfg_args is None:
@@ -190,7 +197,7 @@ def differences(found: io.FoundScene, protocol: Protocol, capture: Capture, back
         said.append("cfg_args: eval=False: the training saw these test pictures")
     view = capture.test[0].view
     trained, _ = found.cfg_args.trained_size(view.width, view.height)
-    tested = view.width / CfgArgs(images=protocol.images).images_reduction / min(protocol.scales)
+    tested = view.width / CfgArgs(images=protocol.source.images).images_reduction / min(protocol.scales)
     if abs(tested - trained) > SIMILAR * trained:
         said.append(f"cfg_args: the training's pictures were {trained} px wide, these are {tested:.0f} (--scales)")
     return said

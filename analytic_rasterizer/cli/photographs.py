@@ -8,10 +8,10 @@ from io import BytesIO
 from pathlib import Path
 
 from ..io import FoundScene, View, to_image
-from ..training.captures import Photograph, load_photographs
+from ..training.captures import Photograph
 from ..training.options import TrainingOptions
 from ..training.pictures import load_pictures
-from ..training.start import capture_arguments
+from ..training.source import CaptureSource
 
 
 def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Callable[[], bytes]], list[str]]:
@@ -23,10 +23,9 @@ def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Ca
     if found.options is None or not views:
         return {}, []
     try:
-        source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-        arguments = capture_arguments(source)
-        arguments.pop("offset", None)  # views are known by their names
-        capture = load_photographs(source["scene"], **arguments)
+        source = CaptureSource.from_dict(found.options["source"])
+        options = TrainingOptions.from_dict(found.options["options"])
+        capture = source.load_photographs()  # in world coordinates: views are known by their names
     except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
         return {}, [f"no photographs: {error}"]
     items = {item.view.name: item for item in (*capture.train, *capture.test)}
@@ -36,7 +35,7 @@ def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Ca
         return lambda: png(item, options, background)
 
     made = {k: reader(items[view.name]) for k, view in enumerate(views) if view.name in items and view.lens is None}
-    return made, [f"{len(made)} photographs of {Path(source['scene'])} to compare with"]
+    return made, [f"{len(made)} photographs of {Path(source.folder)} to compare with"]
 
 
 def png(item: Photograph, options: TrainingOptions, background: tuple[float, float, float]) -> bytes:

@@ -13,12 +13,13 @@ from .. import io
 from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
-from ..training import PictureMemory, Run, TrainingOptions
+from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.evaluation import COLOR_CORRECTED
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
 from ..training.reports import process_age
+from ..training.source import READING
 from .arguments import METAVARS, add_machine_options, port, use_expandable_segments, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
 
@@ -153,18 +154,10 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
     age = process_age()  # most of it is the import of torch
     training = Run(
-        args.scene,
+        CaptureSource(args.scene, **{name: getattr(args, name) for name in READING}, points=args.points),
         args.out,
         options,
         device=args.device,
-        images=args.images,
-        test_every=args.test_every,
-        points=args.points,
-        cameras=args.cameras,
-        lens=args.lens,
-        missing=args.missing,
-        masks=args.masks,
-        alpha=args.alpha,
         save_every=args.save_every,
         resume=args.resume,
         **length,

@@ -5,6 +5,8 @@
     run.train()
     print(run.evaluate()["test"]["mean"])
 
+`Run(CaptureSource("lego", masks="none"), ..)` says how the capture is read.
+
 Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
 """
 
@@ -17,6 +19,7 @@ from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
+from .source import CaptureSource
 from .start import starting_gaussians
 from .store import PictureMemory
 from .trainer import Trainer
@@ -25,6 +28,7 @@ __all__ = [
     "PRESETS",
     "Capture",
     "CapturePlan",
+    "CaptureSource",
     "Finding",
     "Photograph",
     "PictureMemory",

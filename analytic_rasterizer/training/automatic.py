@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from ..distributed.ranks import Ranks
 from .captures import IMAGES
 from .options import TrainingOptions, as_words
 from .plan import CapturePlan, plan_capture, stops_of_photographs
+from .source import CaptureSource
 
 
 class Settled(NamedTuple):
@@ -25,7 +27,7 @@ class Settled(NamedTuple):
 
     Attributes:
         options: With what was taken.
-        given: Arguments of `Run` by name, as chosen or taken; None: as is usual.
+        source: The same of the arguments that say how the capture is read.
         taken: Values by the names of options: what the plan decided.
         lines: What to say of it. The first lines of a training, and none on other ranks than the first.
         notes: What to say later: that the capture could not be looked at.
@@ -33,52 +35,47 @@ class Settled(NamedTuple):
     """
 
     options: TrainingOptions
-    given: dict[str, Any]
-    taken: dict[str, Any]
-    lines: list[str]
-    notes: list[str]
-    stops: dict[Path, Tensor]
+    source: CaptureSource
+    taken: Mapping[str, Any] = MappingProxyType({})
+    lines: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    stops: Mapping[Path, Tensor] = MappingProxyType({})
 
 
-def settle(scene, options: TrainingOptions, given: dict[str, Any], chosen: Collection[str], ranks: Ranks) -> Settled:
+def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[str], ranks: Ranks) -> Settled:
     """Looks at the capture, on the first rank, and takes what it calls for.
 
     Args:
-        scene: Folder of the capture.
-        options: Those that differ from their defaults were chosen.
-        given: Arguments of `Run` by name; None: nobody chose.
+        source, options: What differs from its default was chosen.
         chosen: Names of options that were chosen too, whatever their values.
     """
-    plan = ranks.from_first(_look(scene, given) if ranks.is_first else None)
+    plan = ranks.from_first(_look(source) if ranks.is_first else None)
     if isinstance(plan, str):
-        return Settled(options, given, {}, [], [f"{scene}: not looked at, --effects auto takes nothing: {plan}"], {})
-    defaults = {field.name: field.default for field in fields(TrainingOptions)}
-    values = plan.options
-    kept = [
-        name
-        for name in values
-        if name in chosen or (given[name] is not None if name in given else getattr(options, name) != defaults[name])
-    ]
+        told = f"{source.folder}: not looked at, --effects auto takes nothing: {plan}"
+        return Settled(options, source, notes=[told])
+    defaults = {field.name: field.default for kind in (options, source) for field in fields(kind)}
+    values, given = plan.options, options.to_dict() | vars(source)
+    kept = [name for name in values if name in chosen or given[name] != defaults[name]]
     alone = [] if ranks.world == 1 or "exposure" in kept else ["exposure"]  # which several ranks cannot learn
     taken = {name: value for name, value in values.items() if name not in (*kept, *alone)}
-    changes = {name: value for name, value in taken.items() if name not in given}
-    if "scales" in changes:
-        changes["scale_repeats"] = ()  # as is usual for these
-    given = given | {name: value for name, value in taken.items() if name in given}
+    of_source = {name: value for name, value in taken.items() if name in vars(source)}
+    of_options = {name: value for name, value in taken.items() if name not in of_source}
+    if "scales" in of_options:
+        of_options["scale_repeats"] = ()  # as is usual for these
     lines = []
     if ranks.is_first:
         lines = [*plan.to_lines(), f"--effects auto takes {as_words(taken) or 'nothing'}"]
-        left = {name: values[name] for name in kept if _of(options, given, name) != values[name]}
+        left = {name: values[name] for name in kept if given[name] != values[name]}
         if left:
             lines[-1] += f", and not {as_words(left)}: another value is given"
         refused = {name: values[name] for name in alone if name in values}
         if refused:
             lines[-1] += f", and not {as_words(refused)}, which {ranks.world} processes cannot learn: train on one"
-    return Settled(replace(options, **changes), given, taken, lines, [], plan.stops)
+    return Settled(replace(options, **of_options), replace(source, **of_source), taken, lines, [], plan.stops)
 
 
 @contextmanager
-def said_first(lines: list[str]) -> Iterator[None]:
+def said_first(lines: Sequence[str]) -> Iterator[None]:
     """Says the lines on stderr when the block is done, before its warnings; none after an error of the block."""
     if not lines:
         yield
@@ -94,7 +91,7 @@ def said_first(lines: list[str]) -> Iterator[None]:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
 
 
-def measured_stops(scene, files: Sequence[Path], source: dict[str, Any], known: dict[Path, Tensor]) -> Tensor:
+def measured_stops(source: CaptureSource, files: Sequence[Path], known: Mapping[Path, Tensor]) -> Tensor:
     """(files, 3) of `stops_of_photographs`; NaN where the capture cannot be looked at, as for `settle`.
 
     Args:
@@ -103,18 +100,14 @@ def measured_stops(scene, files: Sequence[Path], source: dict[str, Any], known: 
     if files and all(file in known for file in files):
         return torch.stack([known[file] for file in files])
     try:
-        return stops_of_photographs(scene, files, source["images"] or IMAGES, cameras=source["cameras"])
+        return stops_of_photographs(source.folder, files, source.images or IMAGES, cameras=source.cameras)
     except Exception:
         return torch.full((len(files), 3), math.nan, dtype=torch.float64)
 
 
-def _look(scene, given: dict[str, Any]) -> CapturePlan | str:
+def _look(source: CaptureSource) -> CapturePlan | str:
     """The plan, or why there is none: what is wrong with a capture is for its loader to say, and a look is no need."""
     try:
-        return plan_capture(scene, given["images"] or IMAGES, cameras=given["cameras"])
+        return plan_capture(source.folder, source.images or IMAGES, cameras=source.cameras)
     except Exception as error:
         return str(error) or type(error).__name__
-
-
-def _of(options: TrainingOptions, given: dict[str, Any], name: str) -> Any:
-    return given[name] if name in given else getattr(options, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Protocol
 
 import torch
@@ -155,6 +156,18 @@ def _causes(trainer: Trainer) -> str:
         f"{options.prune_above * extent:.3g}, {options.prune_above:g} extents of the capture ({flag('prune_above')})"
         f"{_about_pictures(trainer)}"
     )
+
+
+def warn_of_one_color(scene, pictures: Pictures) -> None:
+    """Warns if each of the finest pictures has one colour.
+
+    Args:
+        scene: Where they are from.
+    """
+    finest = pictures.colors[min(pictures.colors)]
+    if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
+        told = f"{scene}: all {len(finest)} photographs are of one colour, nothing can be learned"
+        warnings.warn(told, stacklevel=4)  # where the training is made
 
 
 def _about_pictures(trainer: Trainer) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from statistics import mean
@@ -18,8 +17,8 @@ from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
-from .automatic import measured_stops, said_first, settle
-from .captures import Photograph, load_capture
+from .automatic import Settled, measured_stops, said_first, settle
+from .captures import Photograph
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -38,14 +37,15 @@ from .files import (
     write_json,
     write_scene,
 )
-from .health import finite_rows
+from .health import finite_rows, warn_of_one_color
 from .interruption import interruption
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
 from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .start import background_of, capture_arguments, check_source, first_gaussians, of_length, source_of, stored_offset
+from .source import CaptureSource
+from .start import background_of, first_gaussians, of_length
 from .store import PictureMemory, described, processes_here
 from .trainer import Trainer
 
@@ -63,16 +63,13 @@ class Run:
     for the others. All of them read the pictures and the checkpoint, and rank 0 alone writes and shows progress.
 
     Args:
-        scene: Folder of a capture, see `load_capture`.
+        scene: A `CaptureSource`: the capture and how it is read; with `resume` as when the training began, but for what
+            is None. Or the folder of a capture, whose `reading` follows by the names of attributes of `CaptureSource`.
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint. With their `effects` "auto", the default,
-            a training that begins has what the capture calls for in `Run.options`, and says so on stderr.
+            a training that begins has what the capture calls for in `Run.options`, and says so on stderr. Options that
+            differ from their defaults stay as they are.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every, cameras, lens, missing, masks, alpha: As `load_capture`; None: as is usual there. With
-            `resume` None, or the same as when the training began.
-        points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
-            than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
-            began.
         save_every: Steps between checkpoints, besides the last; 0: none.
         resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
         iterations, seconds: With `resume`: how long to train in all, where that is not what the checkpoint says.
@@ -98,19 +95,11 @@ class Run:
 
     def __init__(
         self,
-        scene,
+        scene: CaptureSource | str | Path,
         out,
         options: TrainingOptions | None = None,
         *,
         device: str = "cpu",
-        images: str | None = None,
-        test_every: int | None = None,
-        points=None,
-        cameras: str | None = None,
-        lens: str | None = None,
-        missing: str | None = None,
-        masks: str | None = None,
-        alpha: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         iterations: int | None = None,
@@ -119,7 +108,9 @@ class Run:
         tensorboard: bool = False,
         chosen: Collection[str] = (),
         ranks: Ranks = ALONE,
+        **reading: Any,
     ):
+        source = CaptureSource.of(scene, **reading)
         if save_every < 0:
             raise ValueError(f"save_every must be at least 0, got {save_every}")
         if not resume and (iterations is not None or seconds is not None):
@@ -128,7 +119,8 @@ class Run:
         self.memory.check(torch.device(device))  # raises before anything is read
         began = time.perf_counter()
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
-        self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
+        self.scene, self.out = source.folder, Path(out)
+        self.device, self.save_every, self.ranks = torch.device(device), save_every, ranks
         state = read_checkpoint(self.out / CHECKPOINT, mapped=ranks.world > 1) if resume else None
         stored = None
         if state is not None:
@@ -140,60 +132,78 @@ class Run:
         if tensorboard:
             io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
         self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)
-        given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
-        given |= {"cameras": cameras, "lens": lens, "missing": missing, "masks": masks, "alpha": alpha}
-        taken, lines, later = {} if state is None else state["source"].get("taken", {}), [], []
-        stops: dict[Path, torch.Tensor] = {}
-        if state is None and self.options.effects == "auto":
-            with self._phase("look"):
-                self.options, given, taken, lines, later, stops = settle(scene, self.options, given, chosen, ranks)
-        # Where the scene is, from wherever `evaluate` is called.
-        self.source = {"scene": os.path.abspath(scene), **source_of(given, state), "taken": taken}
-        with said_first(lines):
-            self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
-            self.source["offset"] = self.capture.offset
-            self.notes = [*later, *self.capture.notes]
-            if state is None:  # raises before the pictures are read
-                check_source(Path(scene), self.capture, self.source, chosen)
-                start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
-                if points is None and self.capture.points is None and self.capture.starts_in_view:
-                    self.notes.append(
-                        f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
-                    )
-            else:
-                start, self.points_found = Gaussians(**state["gaussians"]), None
-        background = background_of(self.options, self.capture.background)
-        pictures = self._load(self.capture.train, background, self.memory)
-        if pictures.store.plan.ahead:
-            self.notes.append(described(pictures.store.plan, self.device))
-        finest = pictures.colors[min(self.options.scales)]
-        if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
-            warnings.warn(
-                f"{scene}: all {len(finest)} photographs are of one colour, nothing can be learned", stacklevel=2
-            )
-        if ranks.world == 1:
-            self.trainer = Trainer(self.options, start, pictures, background, self.device)
+        if state is None:
+            start, stops = self._begin(source, chosen)
         else:
-            counts = None if state is None else shards_of(state, ranks)
-            self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, ranks, counts)
+            start, stops = self._continue(source, state), {}
+        self._make_trainer(start, None if state is None else shards_of(state, ranks))
         if self.trainer.exposures is not None and state is None:
             files = [item.files[1] for item in self.capture.train]
             with self._phase("look"):
-                self.trainer.exposures.start(measured_stops(scene, files, self.source, stops))
+                self.trainer.exposures.start(measured_stops(source, files, stops))
         self.clock, self.history = Clock(self.device), []
         if state is not None:
-            if state["pictures"] != len(pictures.views):
-                raise io.SceneError(
-                    f"{scene}: the checkpoint was trained with {state['pictures']} pictures, got {len(pictures.views)}"
-                )
-            self.trainer.load_state_dict(state)
-            self.clock.total, self.history = state["seconds"], state["history"]
-            if self.options != stored:
-                self._change_length(stored)
+            self._load_state(state, stored)
         self.log = Log(self.out / LOG, self.history)
         self.board = TensorBoard(self.out, self.progress.step) if tensorboard else None
         results_folder(self.out)
         self.phases["load"] = time.perf_counter() - began - self.phases["look"]
+
+    def _begin(self, source: CaptureSource, chosen: Collection[str]) -> tuple[Gaussians, Mapping[Path, torch.Tensor]]:
+        """Looks at the capture and loads it. Returns the first Gaussians, and stops of photographs as `settle` has."""
+        found = Settled(self.options, source)
+        if self.options.effects == "auto":
+            with self._phase("look"):
+                found = settle(source, self.options, chosen, self.ranks)
+        self.options = found.options
+        with said_first(found.lines):
+            self._load_capture(found.source.settled(), found.taken)
+            self.notes = [*found.notes, *self.capture.notes]
+            found.source.check_effect(self.capture, chosen)  # raises before the pictures are read
+            start, self.points_found = first_gaussians(self.options, self.capture, source.points, chosen)
+            if source.points is None and self.capture.points is None and self.capture.starts_in_view:
+                random = f"{start.count:,} random ones in the views (--points)"
+                self.notes.append(f"no points in the capture: starts from {random}")
+        return start, found.stops
+
+    def _continue(self, source: CaptureSource, state: dict[str, Any]) -> Gaussians:
+        """Loads the capture of a training that is resumed, in its coordinates. Returns the Gaussians of the state."""
+        before = state["source"]
+        offset = tuple(before.get("offset") or (0.0, 0.0, 0.0))  # earlier versions had none
+        self._load_capture(source.settled(before), before.get("taken", {}), offset=offset)
+        self.notes, self.points_found = list(self.capture.notes), None
+        return Gaussians(**state["gaussians"])
+
+    def _load_capture(self, source: CaptureSource, taken: Mapping[str, Any], **offset: Any) -> None:
+        self.capture = source.load(**offset)
+        self.source = {**source.to_dict(), "taken": dict(taken), "offset": self.capture.offset}
+
+    def _make_trainer(self, start: Gaussians, counts: list[int] | None) -> None:
+        """Reads the pictures, and gives them to a trainer.
+
+        Args:
+            counts: Of a training that is resumed on several ranks, see `ShardedTrainer`.
+        """
+        background = background_of(self.options, self.capture.background)
+        pictures = self._load(self.capture.train, background, self.memory)
+        if pictures.store.plan.ahead:
+            self.notes.append(described(pictures.store.plan, self.device))
+        warn_of_one_color(self.scene, pictures)
+        if self.ranks.world == 1:
+            self.trainer = Trainer(self.options, start, pictures, background, self.device)
+        else:
+            self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, self.ranks, counts)
+
+    def _load_state(self, state: dict[str, Any], stored: TrainingOptions) -> None:
+        """Goes on from a checkpoint, which has the options `stored`."""
+        count = len(self.trainer.pictures.views)
+        if state["pictures"] != count:
+            before = state["pictures"]
+            raise io.SceneError(f"{self.scene}: the checkpoint was trained with {before} pictures, got {count}")
+        self.trainer.load_state_dict(state)
+        self.clock.total, self.history = state["seconds"], state["history"]
+        if self.options != stored:
+            self._change_length(stored)
 
     @property
     def progress(self):

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import io
 from ..gaussians import Gaussians
-from .captures import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture
+from .captures import Capture
 from .extent import seen_distance
 from .health import FAINTEST
 from .model import random_points
@@ -21,62 +18,6 @@ from .options import TrainingOptions
 from .parts import BACKGROUNDS, RANDOM_BACKGROUND
 from .placement import focus_of, points_in_view
 from .unused import check_effect
-
-
-def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, Any]:
-    """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
-
-    Args:
-        given: By the names of Run's arguments; None where nothing is.
-
-    Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
-    """
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
-    usual |= {name: choices[0] for name, choices in CHOICES.items()}
-    if state is not None:
-        # Those of earlier versions have no points: nobody knows them.
-        usual |= {"points": given["points"]} | {
-            name: state["source"][name] for name in usual if name in state["source"]
-        }
-    chosen = {name: usual[name] if value is None else value for name, value in given.items()}
-    for name, value in chosen.items():
-        if state is not None and value != usual[name]:
-            expected = "None" if usual[name] is None else f"{usual[name]} or None"
-            raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
-    return chosen
-
-
-def stored_offset(state: dict[str, Any] | None) -> dict[str, Any]:
-    """The offset in the checkpoint of a training that is resumed; earlier versions had none."""
-    return {} if state is None else {"offset": state["source"].get("offset")}
-
-
-def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of `load_capture`, but for the folder, of a training with this source: that of `options.json`.
-
-    Where it has an offset, also None, positions are relative to that.
-    """
-    arguments = {"images": source["images"], "test_every": source["test_every"]}
-    arguments |= {name: source[name] for name in ("cameras", *CHOICES) if name in source}
-    return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
-
-
-def check_source(folder: Path, capture: Capture, source: dict[str, Any], chosen: Collection[str]) -> None:
-    """Raises ValueError if `images` or `test_every` are among the options `chosen`, and change nothing in the capture.
-
-    Args:
-        folder: Of the capture.
-        source: As it was loaded with.
-    """
-    files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
-    if "images" in chosen and not any(path.is_relative_to(folder / source["images"]) for path in files):
-        raise ValueError(f"--images has no effect: {folder} itself says where its pictures are, as in {files[0]}")
-    if "test_every" in chosen:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # which have been said
-            without = load_capture(folder, **capture_arguments(source | {"test_every": 0}))
-        if without.test:
-            raise ValueError(f"--test-every has no effect: {folder} itself says which pictures are for the test")
 
 
 def of_length(

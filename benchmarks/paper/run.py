@@ -22,6 +22,7 @@ from analytic_rasterizer.training.files import CHECKPOINT, METRICS, OPTIONS, SCE
 from analytic_rasterizer.training.options import TrainingOptions, preset_values
 from analytic_rasterizer.training.pictures import load_pictures
 from analytic_rasterizer.training.run import Run
+from analytic_rasterizer.training.source import CaptureSource
 from analytic_rasterizer.training.start import background_of
 
 from .protocols import Row, Table
@@ -165,14 +166,8 @@ def _train(job: Job, table: Table, device: str) -> bool:
     """Trains, unless that was done before. Returns whether it came to the end; otherwise it was interrupted."""
     if (job.folder / METRICS).exists():
         return True
-    run = Run(
-        job.place,
-        job.folder,
-        job.options,
-        device=device,
-        images=table.images(job.row, job.scene),
-        resume=(job.folder / CHECKPOINT).exists(),
-    )
+    source = CaptureSource(job.place, images=table.images(job.row, job.scene))
+    run = Run(source, job.folder, job.options, device=device, resume=(job.folder / CHECKPOINT).exists())
     if not run.train():
         return False
     write_json(job.folder / METRICS, run.summary())

@@ -1,21 +1,25 @@
 """Small trainings, and which Gaussians their pictures show."""
 
 import inspect
+from dataclasses import fields
 
 import torch
 
-from analytic_rasterizer.training import Run, TrainingOptions
+from analytic_rasterizer.training import CaptureSource, Run, TrainingOptions
 from analytic_rasterizer.training import model as g
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
 OF_RUN = inspect.signature(Run).parameters.keys() - {"device", "iterations", "seconds"}
+OF_SOURCE = {field.name for field in fields(CaptureSource)}
 
 
 def make_run(folder, out, device="cpu", *, more=None, **given) -> Run:
-    """A training that saves nothing before its end. `given` are its options, and arguments of `Run` with other names
-    than options; `more` are further ones of `Run`."""
+    """A training that saves nothing before its end. `given` are its options, what `CaptureSource` says, and arguments
+    of `Run` with other names than options; `more` are further ones of `Run`."""
+    of_source = {name: given.pop(name) for name in OF_SOURCE & given.keys()}
     of_run = {name: given.pop(name) for name in OF_RUN & given.keys()}
-    return Run(folder, out, TrainingOptions(**given), device=device, **{"save_every": 0} | of_run | (more or {}))
+    source, options = CaptureSource(folder, **of_source), TrainingOptions(**given)
+    return Run(source, out, options, device=device, **{"save_every": 0} | of_run | (more or {}))
 
 
 def trained(folder, out, device="cpu", **given) -> Run:

@@ -13,7 +13,7 @@ from wall import cameras, write_wall
 
 from analytic_rasterizer import cli, io, training
 from analytic_rasterizer.distributed.ranks import Ranks
-from analytic_rasterizer.training import TrainingOptions, automatic, files, plan
+from analytic_rasterizer.training import CaptureSource, TrainingOptions, automatic, files, plan
 
 TINY = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300, "density": "none"}
 WORDS = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
@@ -40,8 +40,8 @@ def described(out) -> dict:
 
 
 def settle(folder, options=None, given=None, chosen=(), ranks=None):
-    reading = dict.fromkeys(("images", "cameras", "lens", "missing", "masks", "alpha")) | (given or {})
-    return automatic.settle(folder, options or TrainingOptions(), reading, chosen, ranks or Ranks())
+    source = CaptureSource(folder, **(given or {}))
+    return automatic.settle(source, options or TrainingOptions(), chosen, ranks or Ranks())
 
 
 def test_an_uneven_capture_is_trained_with_corrections(uneven, tmp_path, capsys):
@@ -106,7 +106,7 @@ def test_scales_that_photographs_call_for(tmp_path):
     """With as many repeats as are usual."""
     views = cameras(lambda i: 4.0 if i % 2 else 19.0)
     settled = settle(write_wall(tmp_path, views))
-    assert settled.taken == {"scales": (1, 2, 4, 8)} and settled.given["lens"] is None
+    assert settled.taken == {"scales": (1, 2, 4, 8)} and settled.source.lens is None
     assert settled.options == TrainingOptions(scales=(1, 2, 4, 8))
     assert settle(tmp_path, TrainingOptions(scales=(1, 2))).taken == {}
     assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions()

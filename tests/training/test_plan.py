@@ -14,7 +14,7 @@ from places import SHARED
 from wall import COUNT, SIZE, cameras, photograph, stored, wall_points, write_tracked, write_wall
 
 from analytic_rasterizer import Lens, cli, io
-from analytic_rasterizer.training import automatic, colmap, evidence, plan
+from analytic_rasterizer.training import CaptureSource, automatic, colmap, evidence, plan
 from analytic_rasterizer.training.evidence import medians_of
 from analytic_rasterizer.training.options import as_words
 from analytic_rasterizer.training.photographs import Stored
@@ -72,11 +72,10 @@ def test_stops_of_photographs(tmp_path, monkeypatch):
     assert torch.allclose(stops[:-1] - stops[:-1].mean(0), expected[:, None].expand(-1, 3), atol=0.05)
     assert torch.equal(stops[:-1], torch.stack([known[file] for file in files]))
     # A training that has looked does not look again; what cannot be looked at starts as it is.
-    source = {"images": None, "cameras": None}
     monkeypatch.setattr(automatic, "stops_of_photographs", lambda *_, **__: pytest.fail("looks"))
-    assert torch.equal(automatic.measured_stops(folder, files, source, known), stops[:-1])
+    assert torch.equal(automatic.measured_stops(CaptureSource(folder), files, known), stops[:-1])
     monkeypatch.undo()
-    assert automatic.measured_stops(tmp_path / "none", files, source, {}).isnan().all()
+    assert automatic.measured_stops(CaptureSource(tmp_path / "none"), files, {}).isnan().all()
 
 
 def test_white_balance(tmp_path):
