@@ -20,7 +20,7 @@ OTHERS = {
     "analytic_rasterizer/dialects/analytic.py": {"analytic"},  # the dialects' names
     "analytic_rasterizer/dialects/mip.py": {"mip"},
     "analytic_rasterizer/io/metadata.py": {"mip"},  # what Brush writes into files
-    "analytic_rasterizer/training/options.py": {"box"},  # downsampling
+    "analytic_rasterizer/training/parts.py": {"box"},  # downsampling
     "analytic_rasterizer/training/pictures.py": {"box"},
 }
 
