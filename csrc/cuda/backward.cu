@@ -42,6 +42,7 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
   if (params.channel_sums) clear(params.channel_sums, width);
 }
 
+using Policy = ProjectPolicy;
 using Plain = Camera<float>;
 using Full = FullCamera<float>;
 
@@ -49,8 +50,8 @@ using Full = FullCamera<float>;
 
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun) {
   let_blend_vjp_begin_beside_zero_culled_grads();
-  launch(zero_culled_grads_kernel,
-         {multiprocessors() * ProjectPolicy::kZeroBlocksPerSm, ProjectPolicy::kZeroThreads, 0, begun}, stream, p);
+  launch(zero_culled_grads_kernel, {multiprocessors() * Policy::kZeroBlocksPerSm, Policy::kZeroThreads, 0, begun},
+         stream, p);
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
@@ -66,9 +67,7 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream) {
   const int64_t n = p.sums.n;
   if (!p.channel_sums) return launch_rows(sum_few_channels_kernel, p, n, stream);
   const auto kernel = p.width == kSmallGroup ? sum_channels_kernel<kSmallGroup> : sum_channels_kernel<kChannelGroup>;
-  if (n > 0)
-    launch(kernel, {blocks_of(n, ProjectPolicy::kSumThreads / ProjectPolicy::kSumLanes), ProjectPolicy::kSumThreads},
-           stream, p);
+  if (n > 0) launch(kernel, {blocks_of(n, Policy::kSumThreads / Policy::kSumLanes), Policy::kSumThreads}, stream, p);
 }
 
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
@@ -82,7 +81,7 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
 }
 
 void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream) {
-  launch(sum_camera_grads_kernel, {kCameraNumbers, ProjectPolicy::kSumThreads}, stream, p);
+  launch(sum_camera_grads_kernel, {kCameraNumbers, Policy::kSumThreads}, stream, p);
 }
 
 void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch_rows(row_grads_kernel, p, p.n, stream); }

@@ -36,22 +36,6 @@ template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
   return {unsigned(blocks), Digits<kBits>::kThreads, sizeof(SortShared<kBits, Value>)};
 }
 
-template <class Value>
-void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
-  const TileDigits digits(grid);
-  digits.with_bits([&](auto bits) {
-    const SortScratch<bits> scratch(memory, p.capacity, digits.passes);
-    for (int pass = 0; pass < digits.passes; ++pass) {
-      launch(sort_pass_kernel<bits, Value, false>, sort_shape<bits, Value>(scratch.blocks), stream, scratch, pass,
-             false, &p.counts->listed, p.capacity, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
-             p.values[1 - pass % 2]);
-    }
-  });
-  constexpr int kTiles = BinPolicy::kOffsetTiles, kThreads = kTiles * BinPolicy::kOffsetLanes;
-  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kTiles), kThreads}, stream, p.tiles[digits.passes % 2],
-         p.counts, grid.tiles(), p.tile_offsets, p.feedback);
-}
-
 int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
 
 }  // namespace
@@ -86,12 +70,22 @@ void emit_pairs(const EmitParams& p, cudaStream_t stream) {
          digits);
 }
 
-void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
-  sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
+template <class Value> void sort_by_tile(const TileSort<Value>& p, TileGrid grid, void* memory, cudaStream_t stream) {
+  const TileDigits digits(grid);
+  digits.with_bits([&](auto bits) {
+    const SortScratch<bits> scratch(static_cast<uint32_t*>(memory), p.capacity, digits.passes);
+    for (int pass = 0; pass < digits.passes; ++pass) {
+      launch(sort_pass_kernel<bits, Value, false>, sort_shape<bits, Value>(scratch.blocks), stream, scratch, pass,
+             false, &p.counts->listed, p.capacity, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
+             p.values[1 - pass % 2]);
+    }
+  });
+  constexpr int kTiles = BinPolicy::kOffsetTiles, kThreads = kTiles * BinPolicy::kOffsetLanes;
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kTiles), kThreads}, stream, p.tiles[digits.passes % 2],
+         p.counts, grid.tiles(), p.tile_offsets, p.feedback);
 }
-void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
-  sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
-}
+template void sort_by_tile(const TileSort<int32_t>&, TileGrid, void*, cudaStream_t);
+template void sort_by_tile(const TileSort<SlotPair>&, TileGrid, void*, cudaStream_t);
 
 // blend
 

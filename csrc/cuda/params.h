@@ -243,7 +243,7 @@ void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);
 
-/// Where the device reports the number of pairs (bin/pair_guess.h).
+/// Where the device reports the number of pairs (torch/pair_guess.h).
 struct PairFeedback {
   uint64_t* word;  ///< of the host
   uint32_t frame;
@@ -260,8 +260,7 @@ template <class Value> struct TileSort {
 };
 int tile_sort_result(TileGrid grid);
 /// `scratch`: EmitParams::tile_counts.
-void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
-void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
+template <class Value> void sort_by_tile(const TileSort<Value>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 
 /// Of the current device, for route_of().
 int multiprocessors_of_device();
@@ -297,9 +296,7 @@ void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaS
 
 // Weights of a footprint (weight.cu).
 
-void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream);
-void weight(int footprint, const WeightParams<double>& p, cudaStream_t stream);
-void weight_vjp(int footprint, const WeightParams<float>& p, cudaStream_t stream);
-void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t stream);
+template <typename T> void weight(int footprint, const WeightParams<T>& p, cudaStream_t stream);
+template <typename T> void weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream);
 
 }  // namespace ar::cuda

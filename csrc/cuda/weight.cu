@@ -27,28 +27,22 @@ template <class F, typename T> __global__ void weight_vjp_kernel(const WeightPar
   params.dL_dcovs[i] = g.cov;
 }
 
-template <typename T> void launch_weight(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
-  if (p.n == 0) return;
-  visit_footprint(footprint, Footprints{}, [&](auto f) {
-    launch(weight_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
-  });
-}
-template <typename T> void launch_weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
-  if (p.n == 0) return;
-  visit_footprint(footprint, Footprints{}, [&](auto f) {
-    launch(weight_vjp_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
-  });
-}
-
 }  // namespace
 
-void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream) { launch_weight(footprint, p, stream); }
-void weight(int footprint, const WeightParams<double>& p, cudaStream_t stream) { launch_weight(footprint, p, stream); }
-void weight_vjp(int footprint, const WeightParams<float>& p, cudaStream_t stream) {
-  launch_weight_vjp(footprint, p, stream);
+template <typename T> void weight(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    if (p.n > 0) launch(weight_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+  });
 }
-void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t stream) {
-  launch_weight_vjp(footprint, p, stream);
+template void weight(int, const WeightParams<float>&, cudaStream_t);
+template void weight(int, const WeightParams<double>&, cudaStream_t);
+
+template <typename T> void weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    if (p.n > 0) launch(weight_vjp_kernel<decltype(f), T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
+  });
 }
+template void weight_vjp(int, const WeightParams<float>&, cudaStream_t);
+template void weight_vjp(int, const WeightParams<double>&, cudaStream_t);
 
 }  // namespace ar::cuda

@@ -11,9 +11,9 @@
 #include <optional>
 #include <tuple>
 
-#include "cuda/side_streams.h"
 #include "torch/cuda_frames.h"
 #include "torch/cuda_views.h"
+#include "torch/side_streams.h"
 #include "torch/views.h"
 
 namespace ar::ops {

@@ -1,4 +1,4 @@
-// What backend_cuda.cpp keeps beyond a call: SharedGuesses, how many pairs frames had (bin/pair_guess.h), and Laps, a
+// What backend_cuda.cpp keeps beyond a call: SharedGuesses, how many pairs frames had (pair_guess.h), and Laps, a
 // clock. And whether a frame's pairs are counted.
 #pragma once
 
@@ -7,8 +7,8 @@
 
 #include <mutex>
 
-#include "cuda/bin/pair_guess.h"
 #include "torch/backend.h"
+#include "torch/pair_guess.h"
 #include "torch/pointers.h"
 
 namespace ar::ops {

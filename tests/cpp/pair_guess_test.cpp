@@ -1,4 +1,4 @@
-#include "cuda/bin/pair_guess.h"
+#include "torch/pair_guess.h"
 
 #include <gtest/gtest.h>
 

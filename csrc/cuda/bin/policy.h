@@ -3,17 +3,6 @@
 
 namespace ar::cuda {
 
-struct PairGuessPolicy {
-  /// Frames that are counted, which waits: at first, and after too many pairs.
-  static constexpr int kCountedFrames = 32, kRecountedFrames = 8;
-  /// Per pair of the largest frame so far: memory against frames with too many pairs.
-  static constexpr double kRoomPerPair = 1.25;
-  /// For splats on borders of patches.
-  static constexpr double kRoomPerGaussian = 1.125;
-  /// For small scenes, whose views differ most.
-  static constexpr int kReservedRoom = 1 << 16;
-};
-
 struct BinPolicy {
   /// count_depths: few blocks, because each adds a histogram. Keys loaded at once: registers against waiting.
   static constexpr int kCountThreads = 1024, kCountBlocksPerSm = 1, kCountAtOnce = 4;

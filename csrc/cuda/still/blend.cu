@@ -22,17 +22,16 @@ template <class F, int C, bool kKeep> void launch_kernels(const BlendParams& p, 
   launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
   launch(tail_sum_kernel<LaneSamples<S, F::kLanes>, C, kKeep>, of_sums, stream, p);
 }
-template <class F, int C> void launch_blend(const BlendParams& p, cudaStream_t stream) {
-  if (p.transmittance) return launch_kernels<F, C, true>(p, stream);
-  launch_kernels<F, C, false>(p, stream);
-}
 
 }  // namespace
 
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream) {
   visit_lanes<Family::kStill>(footprint, p.grid, [&](auto of_lane) {
     using F = decltype(of_lane);
-    with_few_channels(p.channels, [&](auto channels) { launch_blend<F, channels>(p, stream); });
+    with_few_channels(p.channels, [&](auto channels) {
+      if (p.transmittance) return launch_kernels<F, channels, true>(p, stream);
+      launch_kernels<F, channels, false>(p, stream);
+    });
   });
 }
 

@@ -30,29 +30,29 @@ template <class F, int C, int kSets>
 __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec2<float> p,
                               PixelState<F::kSamples, C, kSets>& state) {
   using Stage = BlendStage<F, C>;
+  constexpr int kStep = StillPolicy::kBetweenVotes;
   const int reached = stage.list_reached(count);
   int entries[F::kSamples] = {-1};  // of the last splat composited, if kOffsets
   int (&last)[F::kSamples] = Stage::kOffsets ? entries : state.last;
   const int first = Stage::kOffsets ? 0 : index + 1;
-  for (int from = 0; from < reached; from += StillPolicy::kBetweenVotes) {
+  for (int from = 0; from < reached; from += kStep) {
     if (!__any_sync(kAllLanes, state.open())) break;
-    stage.for_each_listed(
-        from, min(reached, from + StillPolicy::kBetweenVotes), [&](TileSplatRef<F, C> splat, auto entry) {
-          const auto composite = [&](int s) {
-            const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
-            last[s] = b.mask ? first + int(entry) : last[s];
-            return b;
-          };
-          if constexpr (kSets == 1) {
-            add_samples<F::kSamples>(state.channels[0], splat.channels, composite);
-          } else {
+    stage.for_each_listed(from, min(reached, from + kStep), [&](TileSplatRef<F, C> splat, auto entry) {
+      const auto composite = [&](int s) {
+        const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
+        last[s] = b.mask ? first + int(entry) : last[s];
+        return b;
+      };
+      if constexpr (kSets == 1) {
+        add_samples<F::kSamples>(state.channels[0], splat.channels, composite);
+      } else {
 #pragma unroll
-            for (int s = 0; s < F::kSamples; ++s) {
-              const Blended<float> b = composite(s);
-              if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
-            }
-          }
-        });
+        for (int s = 0; s < F::kSamples; ++s) {
+          const Blended<float> b = composite(s);
+          if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
+        }
+      }
+    });
   }
   if (Stage::kOffsets && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;
 }

@@ -145,8 +145,9 @@ inline constexpr int kTailSumThreads = 32 * StillPolicy::kTailSumWarps;
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
+  constexpr int kWarps = StillPolicy::kTailSumWarps;
   constexpr int S = Samples::kSamples, kBatch = kKeep ? StillPolicy::kTailLoadsKept : StillPolicy::kTailLoads;
-  __shared__ float sums[StillPolicy::kTailSumWarps][C][32], lasts[StillPolicy::kTailSumWarps][32];
+  __shared__ float sums[kWarps][C][32], lasts[kWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
   const int items = params.plan.state->counts.open_tiles * kTailParts;
@@ -154,7 +155,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
     const int front = front_of(params), chunks = chunks_of(params, tile);
-    const int share = (chunks - front + StillPolicy::kTailSumWarps - 1) / StillPolicy::kTailSumWarps;
+    const int share = (chunks - front + kWarps - 1) / kWarps;
     int begin = min(front + int(threadIdx.x / 32) * share, chunks);  // of the warp's chunks
     const int end = min(begin + share, chunks);
     if (warp == 0) begin = checkpoints.first_chunk;
@@ -185,7 +186,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
 #pragma unroll
       for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
       __syncthreads();
-      for (int w = 0; w < StillPolicy::kTailSumWarps; ++w) {
+      for (int w = 0; w < kWarps; ++w) {
         if (lasts[w][lane] != 0) last = lasts[w][lane];
 #pragma unroll
         for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
@@ -193,7 +194,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       transmittance[s] = last;
       if constexpr (kKeep) {
         Values<C> farther = times(abs(last), background);
-        for (int w = StillPolicy::kTailSumWarps - 1; w > warp; --w) {
+        for (int w = kWarps - 1; w > warp; --w) {
 #pragma unroll
           for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }

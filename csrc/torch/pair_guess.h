@@ -6,9 +6,20 @@
 #include <cstdint>
 
 #include "core/stages.h"
-#include "cuda/bin/policy.h"
 
 namespace ar::cuda {
+
+/// Chosen by measuring.
+struct PairGuessPolicy {
+  /// Frames that are counted, which waits: at first, and after too many pairs.
+  static constexpr int kCountedFrames = 32, kRecountedFrames = 8;
+  /// Per pair of the largest frame so far: memory against frames with too many pairs.
+  static constexpr double kRoomPerPair = 1.25;
+  /// For splats on borders of patches.
+  static constexpr double kRoomPerGaussian = 1.125;
+  /// For small scenes, whose views differ most.
+  static constexpr int kReservedRoom = 1 << 16;
+};
 
 /// Whether the host waits for the count.
 enum class Counting {
