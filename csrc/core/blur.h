@@ -36,7 +36,7 @@ AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64
     const Blur<T> by = blur_of(camera, view);
     if (by.any()) {
       const Cov2d<T>&c = f.cov, all = blurred(f, g, i, by).all;
-      // A negative definite matrix has a positive determinant, and a blur may hide it.
+      // A negative definite matrix has a positive determinant.
       const bool has_mass = c.det >= T(kMinBlurredDet) && c.xx >= T(0) && c.yy >= T(0);
       return {all, has_mass ? sqrt(c.det / all.det) : T(0)};
     }

@@ -13,7 +13,7 @@ template <typename T> struct Shown {
   bool in_front;  ///< weight > 0, and more than half of the light is left after the splat
 };
 
-/// What is looked for. Without statistics a pixel is closed as soon as nothing behind can change the answer.
+/// Without statistics a pixel is closed as soon as nothing behind can change the answer.
 enum class Look {
   kMedian,      ///< `median` alone
   kImages,      ///< and `dominant`
@@ -45,8 +45,8 @@ template <typename T, class P, Look kLook = Look::kStatistics> struct PixelSumma
 
   AR_HD Shown<T> add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
     T weight = T(0);
-    AR_UNROLL
-    for (int s = 0; s < S; ++s) weight += blend_sample<P>(terms, p, s, transmittance[s], states[s]).contribution;
+    AR_UNROLL for (int s = 0; s < S; ++s) weight +=
+        blend_sample<P>(terms, p, s, transmittance[s], states[s]).contribution;
     weight *= T(1.0 / S);
     if constexpr (kLook != Look::kMedian) {
       if (weight > largest) {
@@ -63,8 +63,7 @@ template <typename T, class P, Look kLook = Look::kStatistics> struct PixelSumma
   /// Mean over the samples of the light that is left.
   AR_HD T mean_through() const {
     T through = T(0);
-    AR_UNROLL
-    for (int s = 0; s < S; ++s) through += abs(transmittance[s]);
+    AR_UNROLL for (int s = 0; s < S; ++s) through += abs(transmittance[s]);
     return through * T(1.0 / S);
   }
 };

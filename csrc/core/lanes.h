@@ -59,8 +59,8 @@ AR_HD float max(float a, float b) {
 #endif
 }
 
-/// a * b + c, contracted where there is an instruction. Elsewhere the build turns contraction off, so that forward and
-/// backward passes round alike.
+/// a * b + c, contracted where there is an instruction; the build turns it off elsewhere, so that both passes round
+/// alike.
 AR_HD float madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)
   return std::fma(a, b, c);
@@ -201,7 +201,7 @@ template <class V> AR_HD V odds(V alpha) { return divide(alpha, V(ScalarOf<V>(1)
 /// False for NaN.
 template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(bound); }
 
-/// (1 - exp(-x)) / x on [0, 1/2], with a relative error of 8e-8 in float and 5e-17 in double.
+/// (1 - exp(-x)) / x on [0, 1/2], to 8e-8 relative in float and 5e-17 in double.
 template <class V> AR_HD V one_minus_exp_ratio(V x) {
   using T = ScalarOf<V>;
   constexpr double kMinimax[] = {0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354,
@@ -224,13 +224,11 @@ template <class V> AR_HD V one_minus_exp_ratio(V x) {
                                 1.0 / 1307674368000};
   if constexpr (sizeof(T) == 4) {
     V sum = V(T(kMinimax[4]));
-    AR_UNROLL
-    for (int k = 3; k >= 0; --k) sum = madd(sum, x, V(T(kMinimax[k])));
+    AR_UNROLL for (int k = 3; k >= 0; --k) sum = madd(sum, x, V(T(kMinimax[k])));
     return sum;
   } else {
     V sum = V(T(kTaylor[14]));
-    AR_UNROLL
-    for (int k = 13; k >= 0; --k) sum = madd(sum, x, V(T(kTaylor[k])));
+    AR_UNROLL for (int k = 13; k >= 0; --k) sum = madd(sum, x, V(T(kTaylor[k])));
     return sum;
   }
 }

@@ -187,11 +187,9 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   const Vec3<T> free = {c.x >= T(0) ? dL_dcolor.x : T(0), c.y >= T(0) ? dL_dcolor.y : T(0),
                         c.z >= T(0) ? dL_dcolor.z : T(0)};
   const int used = sh_count(g.sh_degree);
-  AR_UNROLL
-  for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
+  AR_UNROLL for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
-    AR_UNROLL
-    for (int k = 0; k < kCount; ++k) {
+    AR_UNROLL for (int k = 0; k < kCount; ++k) {
       if (k < used) dL_dsh[k] = Out::kAddShs ? dL_dsh[k] + basis[k] * free : basis[k] * free;
     }
     for (int k = used; k < g.sh_stride && !Out::kAddShs; ++k) dL_dsh[k] = {T(0), T(0), T(0)};

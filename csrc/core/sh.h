@@ -97,8 +97,7 @@ template <int kMax, typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d
 template <int kMax, typename T> AR_HD Vec3<T> sh_color(int degree, const T* basis, const Vec3<T>* coefficients) {
   constexpr int kCount = sh_count(kMax);
   Vec3<T> color = {T(0.5), T(0.5), T(0.5)};
-  AR_UNROLL
-  for (int k = 0; k < kCount; ++k) {
+  AR_UNROLL for (int k = 0; k < kCount; ++k) {
     if (k < sh_count(degree)) color += basis[k] * coefficients[k];
   }
   return color;

@@ -20,8 +20,7 @@ template <typename T, class At> AR_HD T window_sum(const At& at) {
   constexpr double kWeights[] = {0.26601172486179434341, 0.21300553771125369989, 0.10936068950970001069,
                                  0.03600077212843082365, 0.00759875813523918418, 0.00102838008447910988};
   T sum = T(kWeights[0]) * at(0);
-  AR_UNROLL
-  for (int k = 1; k <= kSsimRadius; ++k) sum = madd(T(kWeights[k]), at(-k) + at(k), sum);
+  AR_UNROLL for (int k = 1; k <= kSsimRadius; ++k) sum = madd(T(kWeights[k]), at(-k) + at(k), sum);
   return sum;
 }
 

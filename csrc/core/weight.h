@@ -24,8 +24,7 @@ template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
 template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintOptions options) {
   const auto terms = F::terms(F::prepare(with_det(cov), options), T(1));
   T total = T(0);
-  AR_UNROLL
-  for (int s = 0; s < F::kSamples; ++s) total += F::alpha(terms, d, s);
+  AR_UNROLL for (int s = 0; s < F::kSamples; ++s) total += F::alpha(terms, d, s);
   return total / T(F::kSamples);
 }
 
@@ -42,8 +41,7 @@ AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions opti
   const T g = dL_dweight / T(F::kSamples);
   ShapeGrad<T> sums = {};
   T weighted = T(0);
-  AR_UNROLL
-  for (int s = 0; s < F::kSamples; ++s) {
+  AR_UNROLL for (int s = 0; s < F::kSamples; ++s) {
     const T w = F::alpha(terms, d, s);
     F::add_alpha_vjp(terms, d, s, AlphaGrad<T>{g, g * w}, sums);
     weighted += g * w;

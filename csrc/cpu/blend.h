@@ -68,8 +68,7 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
             // With one sample, compositing in vain is faster than this branch.
             if (!moving.look(terms, z, group_first, pixel, group) && kSamples > 1) continue;
             hit = true;
-            AR_UNROLL
-            for (int j = 0; j < Places::kGroup; ++j) {
+            AR_UNROLL for (int j = 0; j < Places::kGroup; ++j) {
               const int s = group_first + j;
               V t = load(transmittance[s] + pixel, V());
               Vec2<V> place = moving.places.at(s, pixel);
@@ -85,8 +84,7 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
           }
           if (!hit) return;
         } else {
-          AR_UNROLL
-          for (int s = 0; s < kSamples; ++s) {
+          AR_UNROLL for (int s = 0; s < kSamples; ++s) {
             V t = load(transmittance[s] + pixel, V());
             const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
             store(transmittance[s] + pixel, t);

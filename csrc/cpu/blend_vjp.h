@@ -34,8 +34,7 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   V sums[4] = {zero, zero, zero, zero};  // Four hide the latency of madd.
   int c = 3;
   for (; c + 4 <= count; c += 4) {
-    AR_UNROLL
-    for (int k = 0; k < 4; ++k) sums[k] = term(c + k, sums[k]);
+    AR_UNROLL for (int k = 0; k < 4; ++k) sums[k] = term(c + k, sums[k]);
   }
   for (; c < count; ++c) sums[0] = term(c, sums[0]);
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
@@ -149,8 +148,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
         MovingBlendGrad<V> grad = no_moving_blend_grad<V>();
         do {
           auto found = replay.take();
-          AR_UNROLL
-          for (int j = 0; j < Replay<P, T>::kGroup; ++j) {
+          AR_UNROLL for (int j = 0; j < Replay<P, T>::kGroup; ++j) {
             const int s = found.first + j;
             if (found.lanes[j] == 0) continue;
             V raw;
@@ -170,8 +168,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
         of_pixel = grad.of_splat.sums;
         shape = shape + of_pixel;
       } else {
-        AR_UNROLL
-        for (int s = 0; s < kSamples; ++s) {
+        AR_UNROLL for (int s = 0; s < kSamples; ++s) {
           const V alpha = P::alpha(terms, at, s);
           const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
           V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());

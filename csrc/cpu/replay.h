@@ -56,8 +56,7 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   /// For whitened pixels z. False if no alpha reaches its minimum: then no exponential is needed.
   template <class Terms> AR_HD bool look(const Terms& terms, Vec2<V> z, int first, int pixel, Group& group) const {
     V most = V(T(kLogAlphaMin - 1));
-    AR_UNROLL
-    for (int j = 0; j < kGroup; ++j) {
+    AR_UNROLL for (int j = 0; j < kGroup; ++j) {
       group.z[j] = P::whitened_node(terms, z, places.at(first + j, pixel));
       group.log_alpha[j] = P::log_alpha(terms, group.z[j]);
       most = max(most, group.log_alpha[j]);
@@ -194,8 +193,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
         if (!samples_.look(terms, z, group_first, pixel, group)) continue;
         Entry& entry = end_[-entries_ - 1];
         uint32_t composited = 0;
-        AR_UNROLL
-        for (int j = 0; j < kGroup; ++j) {
+        AR_UNROLL for (int j = 0; j < kGroup; ++j) {
           const int s = group_first + j;
           const V raw = exp2(group.log_alpha[j]);
           const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & (index < load_index(tile_.last[s] + pixel, V()));

@@ -1,5 +1,5 @@
 // Parameters of the CPU's stages beyond core/stages.h, and Stages, the table of functions that run them.
-// csrc/torch/backend_cpu.cpp sets the parameters and owns all memory. dispatch.cpp fills the tables.
+// backend_cpu.cpp sets the parameters and owns all memory.
 #pragma once
 
 #include <cstdint>
@@ -40,7 +40,7 @@ template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
   RowRules<T> rules;
-  RowOutputs<T> rows;    ///< Of a row that is not drawn, nothing is written.
+  RowOutputs<T> rows;    ///< Not of rows that are not drawn.
   PackedRows<T> packed;  ///< Instead of rows.
   int32_t* flags;        ///< [gaussians] instead of both: 1 for a Gaussian that has a row, else 0.
 };

@@ -132,8 +132,7 @@ template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& spla
     const TilePixels<T>& of_tile = kTilePixelsOf<T>;
     const Vec2<V> center = {V(first.x) + load(of_tile.left + pack, V()), V(first.y) + load(of_tile.top + pack, V())};
     const Vec2<V> z = transform(w, center);
-    AR_UNROLL
-    for (int c = 0; c < Packs<T>::kColumns; c += kTogether) {
+    AR_UNROLL for (int c = 0; c < Packs<T>::kColumns; c += kTogether) {
       const T to_right = T(c * kWidth);
       reached.add(c * kRows + pack,
                   bits(reaches_box(reach, Vec2<V>{z.x + V(w.xx * to_right), z.y + V(w.yx * to_right)})));
@@ -142,8 +141,7 @@ template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& spla
   if constexpr (kLanes == 1) {  // Unrolled, this would take half of the build.
     for (int pack = 0; pack < kRows; ++pack) look(pack);
   } else {
-    AR_UNROLL
-    for (int pack = 0; pack < kRows; pack += kLanes) look(pack);
+    AR_UNROLL for (int pack = 0; pack < kRows; pack += kLanes) look(pack);
   }
   return reached;
 }
@@ -182,9 +180,8 @@ template <typename T> struct LastPairs {
   /// The packs that composited pair `index` or a later one.
   AR_HD PackSet<T> from(IndexOf<V> index) const {
     PackSet<T> packs = {};
-    AR_UNROLL
-    for (int i = 0; i < Packs<T>::kCount; i += Packs<T>::kLanes)
-      packs.add(i, bits(index < load_index(of_pack + i, V())));
+    AR_UNROLL for (int i = 0; i < Packs<T>::kCount; i += Packs<T>::kLanes)
+        packs.add(i, bits(index < load_index(of_pack + i, V())));
     return packs;
   }
 };

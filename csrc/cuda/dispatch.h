@@ -39,7 +39,7 @@ template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit
   }
   visit(std::integral_constant<int, kSmall>());
 }
-/// Calls f with what a lane blends of F in this grid: F, or one sample of it (F::Spread).
+/// f(F{}), or f(F::Spread{}) where a lane blends one sample.
 template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
   with_tile_side<F>(grid, [&](auto side) {
     using OfLane = std::conditional_t<(side < kTile), typename F::Spread, F>;
@@ -60,7 +60,7 @@ inline Family family_at(int footprint, int64_t channels) {
   visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
   return found;
 }
-/// Calls f with what a lane blends of a footprint, if kFamily has kernels for it.
+/// The same, if kFamily has kernels for it.
 template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {
   visit_pixels(footprint, [&](auto pixels) {
     using F = decltype(pixels);

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "core/platform.h"
+
 namespace ar::cuda {
 
 inline constexpr uint32_t kAllLanes = 0xffffffff;
@@ -12,24 +14,21 @@ __device__ inline int lane_id() { return threadIdx.x % 32; }
 
 /// In every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
-#pragma unroll
-  for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
+  AR_UNROLL for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
   return v;
 }
 
 /// Sums over a block, in a fixed order, for its first thread. Once in a kernel.
 template <int kWarps, int kCount, typename T> __device__ void sum_block(T (&sums)[kCount]) {
   __shared__ T of_warps[kWarps][kCount];
-#pragma unroll
-  for (int k = 0; k < kCount; ++k) {
+  AR_UNROLL for (int k = 0; k < kCount; ++k) {
     sums[k] = warp_sum(sums[k]);
     if (lane_id() == 0) of_warps[threadIdx.x / 32][k] = sums[k];
   }
   __syncthreads();
   if (threadIdx.x > 0) return;
   for (int w = 1; w < kWarps; ++w) {
-#pragma unroll
-    for (int k = 0; k < kCount; ++k) sums[k] += of_warps[w][k];
+    AR_UNROLL for (int k = 0; k < kCount; ++k) sums[k] += of_warps[w][k];
   }
 }
 
@@ -45,15 +44,13 @@ __device__ inline float sum_of_pair(const float& x, const float& y, bool upper, 
 /// Lanes below 16 get the warp_sum of x, the others of y.
 __device__ inline float warp_sum_of_two(float x, float y) {
   float sum = sum_of_pair(x, y, lane_id() & 16, 16);
-#pragma unroll
-  for (int offset = 8; offset > 0; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
+  AR_UNROLL for (int offset = 8; offset > 0; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
   return sum;
 }
 
 /// T has shuffle(), shuffle_up() and a +, which need not commute.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
-#pragma unroll
-  for (int offset = 1; offset < 32; offset *= 2) {
+  AR_UNROLL for (int offset = 1; offset < 32; offset *= 2) {
     const T before = shuffle_up(v, offset);
     if (lane_id() >= offset) v = before + v;
   }
@@ -76,8 +73,7 @@ template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all)
     __syncthreads();
     T front = zero;
     all = zero;
-#pragma unroll
-    for (int w = 0; w < kWarps; ++w) {
+    AR_UNROLL for (int w = 0; w < kWarps; ++w) {
       if (w == warp) front = all;
       all = all + warps[w];
     }
@@ -126,8 +122,7 @@ __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 /// Lanes with the same number < 2^kBits.
 template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   uint32_t lanes = kAllLanes;
-#pragma unroll
-  for (int b = 0; b < kBits; ++b) lanes &= lanes_that_agree(number, 1u << b);
+  AR_UNROLL for (int b = 0; b < kBits; ++b) lanes &= lanes_that_agree(number, 1u << b);
   return lanes;
 }
 
@@ -192,8 +187,7 @@ template <class T> __device__ void copy_async(T* to, const T* from) {
 }
 /// Rows [32, kWidth] of `lanes`.
 template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
-#pragma unroll
-  for (int k = 0; k < kWidth; ++k) {
+  AR_UNROLL for (int k = 0; k < kWidth; ++k) {
     const int e = 32 * k + lane_id();
     if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
   }
@@ -214,13 +208,10 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();
   float a[8], last = N > 8 ? v[N > 8 ? 8 : 0] : 0;
-#pragma unroll
-  for (int i = 0; i < 8; ++i) a[i] = v[i];
-#pragma unroll
-  for (int half = 4, offset = 16; half > 0; half /= 2, offset /= 2) {
+  AR_UNROLL for (int i = 0; i < 8; ++i) a[i] = v[i];
+  AR_UNROLL for (int half = 4, offset = 16; half > 0; half /= 2, offset /= 2) {
     const bool upper = lane & offset;
-#pragma unroll
-    for (int i = 0; i < half; ++i) a[i] = sum_of_pair(a[i], a[i + half], upper, offset);
+    AR_UNROLL for (int i = 0; i < half; ++i) a[i] = sum_of_pair(a[i], a[i + half], upper, offset);
     if (N == 10 && half == 4) {
       last = sum_of_pair(last, v[N - 1], upper, offset);
     } else if (N > 8) {

@@ -232,7 +232,7 @@ struct BinArguments : ImageArguments {
 
 struct BlendArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, features, background;
-  OptionalTensor means2d_abs;  ///< Only for its gradient, sums over pixels of |dL/dmeans2d|.
+  OptionalTensor means2d_abs;  ///< Its gradient: sums over pixels of |dL/dmeans2d|.
   Tensor dets, row_splits;
   std::vector<Tensor> lists;  ///< Of `bin`.
   bool keep = false;
@@ -258,10 +258,10 @@ struct CompositeArguments : ImageArguments {
   OptionalTensor background;   ///< (..., K), of the first channels, zero behind others.
   OptionalTensor means2d_abs;  ///< As in BlendArguments.
   Tensor dets, depths, row_splits;
-  double center = 0;      ///< Where pixels have their centres in means2d.
+  double center = 0;      ///< Of pixels, in means2d.
   bool expected = false;  ///< The last channel is divided by alpha.
   bool keep = false;
-  int64_t background_channels = 0;  ///< Of `background` as it was given; check() fills it up.
+  int64_t background_channels = 0;  ///< Of `background` as given; check() fills it up.
 
   template <class Visit> void each(Visit&& visit) {
     visit("means2d", means2d);

@@ -120,7 +120,7 @@ struct RowTensors {
   Tensor absolute;  ///< Of a gradient: (n, 2) sums of |dL/dmeans2d|.
   Tensor packed;    ///< PackedRow or its gradient, instead of all others.
   KeptRows kept;
-  double center = 0;       ///< Where pixels have their centres in means2d.
+  double center = 0;       ///< Of pixels, in means2d.
   bool any_color = false;  ///< A colour that is not finite is drawn.
 
   std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
@@ -136,7 +136,7 @@ struct ProjectedTensors {
   Tensor ends;                      ///< (P,) int32 of this camera; undefined: a table.
   Tensor flags;                     ///< (P,) int32, instead of all others.
   bool colored = false, shows_depth = false;
-  int64_t camera = 0, first = 0, last = 0;  ///< The camera's number; its first row and, with `ends`, its last.
+  int64_t camera = 0, first = 0, last = 0;  ///< Of its rows, `last` only with `ends`.
   double center = 0;
 };
 
@@ -171,18 +171,17 @@ struct FootprintSpec {
   bool moves;   ///< Samples have a position as state.
   int lanes;    ///< Of CUDA, for a pixel's samples.
 };
-/// Raises ValueError if there is none.
 FootprintSpec find_footprint(const std::string& key, double option);
 
-/// On CUDA some footprints have small tiles (cuda/dispatch.h).
+/// On CUDA some have small tiles (cuda/dispatch.h).
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
 struct Pass {
   FootprintSpec footprint;
   TileGrid grid;
   bool keep = false;   ///< For a backward pass.
-  bool debug = false;  ///< Wait for every stage, so that the right one raises.
-  bool exact;          ///< Count pairs. Else CUDA guesses by earlier frames.
+  bool debug = false;  ///< Wait for every stage.
+  bool exact;          ///< Count pairs, which CUDA else guesses.
 
   template <class Arguments>
   Pass(const Arguments& a, const Tensor& like)

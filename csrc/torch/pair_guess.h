@@ -9,7 +9,6 @@
 
 namespace ar::cuda {
 
-/// Chosen by measuring.
 struct PairGuessPolicy {
   /// Frames that are counted, which waits: at first, and after too many pairs.
   static constexpr int kCountedFrames = 32, kRecountedFrames = 8;

@@ -2,7 +2,6 @@
 // a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
 // and defocus.h call it. pinhole.h shows the arguments.
 //
-//
 // `camera` is a Camera or a FullCamera, `mean` a point of the world, `view` the same point in camera space, p a
 // ProjectedMean. Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
 //

@@ -158,8 +158,7 @@ template <class Model> struct LensModel : CameraModelDefaults {
   AR_HD_CALL static void add_by_coefficients(Vec3<T> p, Vec2<T> g, Rows<T> G, const T* distortion, T* to) {
     Line<T> k[kDistortion];
     for (int i = 0; i < kDistortion; ++i) k[i] = Line<T>(distortion[i]);
-    AR_NO_UNROLL
-    for (int i = 0; i < kDistortion; ++i) {
+    AR_NO_UNROLL for (int i = 0; i < kDistortion; ++i) {
       k[i].slope = T(1);
       const auto u = Model::image_point(variables(Line<T>(p.x), Line<T>(p.y), Line<T>(p.z)), k);
       to[i] += g.x * u.x.value.slope + g.y * u.y.value.slope + dot(G.x, slopes(u.x.gradient)) +

@@ -11,7 +11,7 @@ namespace ar {
 inline constexpr double kLogistic1 = 1.6;
 inline constexpr double kLogistic3 = 0.07;
 
-/// Lower bound of standard deviations [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
+/// Least standard deviation [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
 /// Along an axis of a splat's frame, t = u/sigma.

@@ -147,8 +147,7 @@ struct Exact : FootprintDefaults {
       const V step = V(t.along) * (pixel.wide.middle() + V(Rule::node(i))), x = pixel.z.x + step;
       const V middle = madd(across, pixel.narrow.middle(), madd(V(-t.tilt), step, pixel.z.y));
       NormalMoments<V> line = {zero, zero, zero};
-      AR_UNROLL
-      for (int j = 0; j < N; ++j) {
+      AR_UNROLL for (int j = 0; j < N; ++j) {
         const V y = madd(across, V(Rule::node(j)), middle), f = V(Rule::weight(j)) * normal(y);
         line = {line.value + f, madd(f, y, line.first), madd(f * y, y, line.second)};
       }

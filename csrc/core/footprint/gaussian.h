@@ -108,8 +108,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const Lower2<T> w = T(kBase2) * shape.w;
     Terms<T> t{w, log2(opacity * shape.amp), {}};
-    AR_UNROLL
-    for (int s = 0; s < S; ++s) {
+    AR_UNROLL for (int s = 0; s < S; ++s) {
       const Vec2<double> n = box_node<S>(s);
       t.node[s] = transform(w, Vec2<T>{origin.x + T(n.x), origin.y + T(n.y)});
     }

@@ -74,8 +74,7 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   using Rule = GaussLegendre<kFewNodes<T>, T>;
   const V zero = V(T(0));
   NormalMoments<V> m = {zero, zero, zero};
-  AR_UNROLL
-  for (int i = 0; i < kFewNodes<T>; ++i) {
+  AR_UNROLL for (int i = 0; i < kFewNodes<T>; ++i) {
     const V x = madd(width, V(Rule::node(i)), z), w = width * V(Rule::weight(i)) * normal(x);
     m = {m.value + w, madd(w, x, m.first), madd(w * x, x, m.second)};
   }

@@ -33,8 +33,7 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
-#pragma unroll
-  for (int k = 0; k < kRows; ++k) {
+  AR_UNROLL for (int k = 0; k < kRows; ++k) {
     const int64_t up_to = warp_inclusive_sum(int64_t(pairs_of[k]));
     before[k] = all + up_to - pairs_of[k];
     all += shuffle(up_to, 31);
@@ -43,8 +42,7 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
   int64_t first = 0;
   if (lane_id() == 0) first = add_to_count(counts.pairs, all);
   first = shuffle(first, 0);
-#pragma unroll
-  for (int k = 0; k < kRows; ++k) {
+  AR_UNROLL for (int k = 0; k < kRows; ++k) {
     if (pairs_of[k] > 0) ranges[k * stride].first = int32_t(first + before[k]);
   }
 }
@@ -66,15 +64,13 @@ __global__ void __launch_bounds__(BinPolicy::kCountThreads)
   for (int64_t from = thread; from < rounded; from += kAtOnce * stride) {
     uint32_t key[kAtOnce];
     int pairs_of[kAtOnce];
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
+    AR_UNROLL for (int k = 0; k < kAtOnce; ++k) {
       const int64_t i = from + k * stride;
       key[k] = i < n ? keys[i] : kCulledKey;
     }
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) pairs_of[k] = key[k] != kCulledKey ? ranges[from + k * stride].count : 0;
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
+    AR_UNROLL for (int k = 0; k < kAtOnce; ++k) pairs_of[k] =
+        key[k] != kCulledKey ? ranges[from + k * stride].count : 0;
+    AR_UNROLL for (int k = 0; k < kAtOnce; ++k) {
       const bool valid = key[k] != kCulledKey;
       count_digits<kDepthBits, kDepthPasses>(key[k], valid, local);
       if (!with_slots) pairs += pairs_of[k];
@@ -208,21 +204,18 @@ __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
   int32_t ids[kRows];
   SplatTiles touched[kRows] = {};
   int32_t slots[kRows] = {};
-#pragma unroll
-  for (int row = 0; row < kRows; ++row) {
+  AR_UNROLL for (int row = 0; row < kRows; ++row) {
     const int64_t r = int64_t(block_id) * BinPolicy::kEmitSplats + row * kThreads + threadIdx.x;
     ids[row] = r < n ? params.order[r] : -1;
   }
-#pragma unroll
-  for (int row = 0; row < kRows; ++row) {
+  AR_UNROLL for (int row = 0; row < kRows; ++row) {
     if (ids[row] >= 0) {
       touched[row] = params.splat_tiles[ids[row]];
       if (params.slot_pairs) slots[row] = params.ranges[ids[row]].first;
     }
   }
   uint32_t before[kRows], sum = 0;
-#pragma unroll
-  for (int row = 0; row < kRows; ++row) {
+  AR_UNROLL for (int row = 0; row < kRows; ++row) {
     uint32_t of_row;
     before[row] = sum + sum_before<kWarps>(uint32_t(touched[row].count), 0u, of_row);
     sum += of_row;
@@ -232,14 +225,12 @@ __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
   // While earlier blocks count: tiles in shared memory, for neighbouring lanes to write.
   const int warp = threadIdx.x / 32;
   int up_to[kRows];  // listed, up to this lane
-#pragma unroll
-  for (int row = 0; row < kRows; ++row) {
+  AR_UNROLL for (int row = 0; row < kRows; ++row) {
     const TileMask mask = few_tiles(touched[row]);
     const int own = mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
     MaskedPair* next = stages[row][warp] + up_to[row] - own;
-#pragma unroll
-    for (int from = 0; from < MaskedPair::kBits; from += 32) {
+    AR_UNROLL for (int from = 0; from < MaskedPair::kBits; from += 32) {
       for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
         *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
     }
@@ -255,8 +246,7 @@ __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
   }
   __syncthreads();
   const int columns = params.grid.columns();
-#pragma unroll
-  for (int row = 0; row < kRows; ++row) {
+  AR_UNROLL for (int row = 0; row < kRows; ++row) {
     const SplatTiles& of_splat = touched[row];
     const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
@@ -280,8 +270,7 @@ __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
       const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
       const TileMask mask = shuffle(of_splat.mask, source);
       int32_t next = shuffle(begin, source);
-#pragma unroll
-      for (int from = 0; from < MaskedPair::kBits; from += 32) {
+      AR_UNROLL for (int from = 0; from < MaskedPair::kBits; from += 32) {
         const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
         const int32_t position = next + __popc(bits & (lane - 1));
         if (bits & lane) writer.write(position, uint32_t(tile + from / 8 * columns), id, position + slot_from);
@@ -323,13 +312,11 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
 #pragma unroll 4
   for (int64_t r = threadIdx.x; r < n; r += kThreads) {
     const BoxOfTiles tiles = tiles_of_splat(params.order[r]);
-#pragma unroll
-    for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_patches(k + 1).count();
+    AR_UNROLL for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_patches(k + 1).count();
   }
   int bits = 0;
   while (1 << bits < max(grid.columns(), grid.rows())) ++bits;
-#pragma unroll
-  for (int k = kSizes - 1; k >= 0; --k) {
+  AR_UNROLL for (int k = kSizes - 1; k >= 0; --k) {
     int64_t all;
     sum_before<kWarps>(of_sizes[k], int64_t(0), all);
     if (all <= params.capacity) bits = k + 1;

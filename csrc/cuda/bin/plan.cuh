@@ -38,7 +38,6 @@ struct PlannedTile {
   __device__ int full_class() const { return work_class(is_long ? n : length); }
 };
 
-/// Each block counts a part of the tiles. state: [1].
 __global__ void __launch_bounds__(PlanPolicy::kCountThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
@@ -52,8 +51,7 @@ __global__ void __launch_bounds__(PlanPolicy::kCountThreads)
        first += PlanPolicy::kTilesAtOnce * stride) {
     const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), cut); };
     const PlannedTile at_once[PlanPolicy::kTilesAtOnce] = {planned(first), planned(first + stride)};
-#pragma unroll
-    for (int k = 0; k < PlanPolicy::kTilesAtOnce; ++k) {
+    AR_UNROLL for (int k = 0; k < PlanPolicy::kTilesAtOnce; ++k) {
       if (first + k * stride >= tiles) break;
       const PlannedTile& tile = at_once[k];
       const int full = tile.full(), rest = tile.rest();
@@ -73,17 +71,16 @@ __global__ void __launch_bounds__(PlanPolicy::kCountThreads)
   if (c == 0) counts.planes = counts.tail = counts.open_tiles = 0;
 }
 
-/// Of class threadIdx.x; `of` chooses tiles or chunks.
+/// Of class threadIdx.x; `of`: tiles or chunks.
 template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
   static_assert(kLengthClasses < PlanPolicy::kThreads);
   const int c = threadIdx.x;
   int size = 0;
-#pragma unroll
-  for (int k = 0; k < PlanState::kCounters; ++k) size += c < kLengthClasses ? of(state.counted[k])[c] : 0;
+  AR_UNROLL for (int k = 0; k < PlanState::kCounters; ++k) size += c < kLengthClasses ? of(state.counted[k])[c] : 0;
   return size;
 }
 
-/// Which lists are cut: classes of long lists, longest first, up to the limit of segments.
+/// Classes of long lists are cut, longest first, up to the limit of segments.
 struct CutClasses {
   int lists = 0, segments = 0, longest = 0;
   int chunks_of_class;  ///< of this thread's class
@@ -106,8 +103,7 @@ struct CutClasses {
   }
 };
 
-/// Where each class begins, in shared memory. `size`: of this thread's class. Returns the size of all. All threads must
-/// call it, then __syncthreads().
+/// `size`: of this thread's class. Returns the size of all. All threads must call it, then __syncthreads().
 __device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   const int c = threadIdx.x;
   int all;

@@ -21,7 +21,7 @@ template <int kBits> struct Digits : SortPolicy<kBits> {
 /// The key of no item.
 inline constexpr uint32_t kNoKey = 0xffffffff;
 
-// A block publishes a count, and whether it includes all earlier blocks. Zero: nothing yet.
+// A count, and whether it includes all earlier blocks. Zero: not yet.
 inline constexpr uint32_t kOfBlock = 1u << 30, kUpToBlock = 2u << 30, kCountMask = kOfBlock - 1;
 inline constexpr int64_t kMaxSortItems = kCountMask;
 
@@ -65,8 +65,7 @@ template <int kBits> struct SortScratch {
 template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
   constexpr int kBins = Digits<kBits>::kBins;
   if (!__any_sync(kAllLanes, valid)) return;
-#pragma unroll
-  for (int pass = 0; pass < kPasses; ++pass) {
+  AR_UNROLL for (int pass = 0; pass < kPasses; ++pass) {
     const uint32_t digit = Digits<kBits>::of(key, pass);
     // Neighbours often agree; atomics to one address are slow.
     int agree = 0;
@@ -79,16 +78,15 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
   }
 }
 
-/// Items of earlier blocks. `status`: of this block; the block before is `width` words before.
+/// `status`: of this block; that of the block before is `width` words before.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
   if (block == 0) return 0;
   uint32_t sum = 0;
   for (int64_t back = 1;;) {
     uint32_t words[BinPolicy::kLookBackAtOnce];
-#pragma unroll
-    for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) words[k] = read_status(status - min(back + k, block) * width);
-#pragma unroll
-    for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) {
+    AR_UNROLL for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) words[k] =
+        read_status(status - min(back + k, block) * width);
+    AR_UNROLL for (int k = 0; k < BinPolicy::kLookBackAtOnce; ++k) {
       if (words[k] == 0) break;
       sum += words[k] & kCountMask;
       if (words[k] & kUpToBlock) return sum;
@@ -145,16 +143,13 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   const int64_t first = begin + warp * 32 * kItems + lane;
   const bool whole = begin + D::kTile <= n;
   uint32_t keys[kItems];
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) {
+  AR_UNROLL for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
+  AR_UNROLL for (int i = 0; i < kItems; ++i) {
     // Later passes count keys past the end, which come last.
     if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
   Value values[kItems];
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) {
+  AR_UNROLL for (int i = 0; i < kItems; ++i) {
     if constexpr (kFirst) {
       values[i] = Value(first + 32 * i);
     } else if (whole || first + 32 * i < n) {
@@ -167,8 +162,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   uint32_t mine = 0;
   uint32_t* status = scratch.status + (pass * scratch.blocks + block) * kBins + t;
   if (has_digit) {
-#pragma unroll
-    for (int w = 0; w < D::kWarps; ++w) mine += shared.counts[w][t];
+    AR_UNROLL for (int w = 0; w < D::kWarps; ++w) mine += shared.counts[w][t];
     write_status(status, (block == 0 ? kUpToBlock : kOfBlock) | mine);
   }
   uint64_t all;
@@ -176,8 +170,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   const auto in_block = uint32_t(before), in_all = uint32_t(before >> 32);
   if (has_digit) {
     uint32_t position = in_block;
-#pragma unroll
-    for (int w = 0; w < D::kWarps; ++w) {
+    AR_UNROLL for (int w = 0; w < D::kWarps; ++w) {
       shared.next[w][t] = uint16_t(position);
       position += shared.counts[w][t];
     }
@@ -185,8 +178,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   __syncthreads();
 
   const uint32_t lanes_before = (1u << lane) - 1, lanes_after = ~lanes_before << 1;
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) {
+  AR_UNROLL for (int i = 0; i < kItems; ++i) {
     const bool valid = !kFirst || keys[i] != kNoKey;
     uint32_t peers = kFirst ? __ballot_sync(kAllLanes, valid) : kAllLanes;
     if (kFirst && peers == 0) continue;
@@ -210,8 +202,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   __syncthreads();
 
   const uint32_t here = kFirst ? uint32_t(all) : uint32_t(min(n - begin, int64_t(D::kTile)));
-#pragma unroll
-  for (int i = 0; i < kItems; ++i) {
+  AR_UNROLL for (int i = 0; i < kItems; ++i) {
     const uint32_t k = i * D::kThreads + t;
     if (k >= here) break;
     const uint32_t key = shared.sorted.keys[k], position = shared.to_global[D::of(key, pass)] + k;

@@ -25,26 +25,21 @@ template <int C> struct ChannelShare {
   __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
   __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
 
-  /// From own pixels of lanes to this lane's pixels.
   __device__ static void spread(float own, float (&of_pixels)[kPixels]) {
     of_pixels[0] = own;
-#pragma unroll
-    for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
+    AR_UNROLL for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
   }
   __device__ static void read(const Eighth<C> (&splat)[8], float (&own)[kOwn]) {
     const Eighth<C> first = splat[lane_id() / 4], second = splat[lane_id() / 4 ^ 1];
-#pragma unroll
-    for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
+    AR_UNROLL for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
   }
 
   __device__ void add(float contribution, const Eighth<C> (&splat)[8]) {
     float contributions[kPixels], own[kOwn];
     spread(contribution, contributions);
     read(splat, own);
-#pragma unroll
-    for (int i = 0; i < kPixels; ++i) {
-#pragma unroll
-      for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
+    AR_UNROLL for (int i = 0; i < kPixels; ++i) {
+      AR_UNROLL for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
   /// Each lane of the pixel gets the sum.
@@ -55,37 +50,29 @@ template <int C> struct ChannelShare {
       add_from_lane(2, 0);
     }
     if constexpr (kLanes == 16) {
-      add_from_lane(4, kHalf);  // its eighths are in the other order
-#pragma unroll
-      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart
-#pragma unroll
-        for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
+      add_from_lane(4, kHalf);                          // its eighths are in the other order
+      AR_UNROLL for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart
+        AR_UNROLL for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
       }
     }
   }
   /// From channel `first` of lane_id() ^ offset on, cyclically.
   __device__ void add_from_lane(int offset, int first) {
-#pragma unroll
-    for (int i = 0; i < kPixels; ++i) {
+    AR_UNROLL for (int i = 0; i < kPixels; ++i) {
       float given[kOwn];
-#pragma unroll
-      for (int k = 0; k < kOwn; ++k) given[k] = __shfl_xor_sync(kAllLanes, v[i][(k + first) % kOwn], offset);
-#pragma unroll
-      for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
+      AR_UNROLL for (int k = 0; k < kOwn; ++k) given[k] = __shfl_xor_sync(kAllLanes, v[i][(k + first) % kOwn], offset);
+      AR_UNROLL for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
     }
   }
   /// Of the own pixel, with a number per channel.
   __device__ float dot(const float (&own)[kOwn]) const {
     float parts[kPixels];
-#pragma unroll
-    for (int i = 0; i < kPixels; ++i) {
+    AR_UNROLL for (int i = 0; i < kPixels; ++i) {
       parts[i] = v[i][0] * own[0];
-#pragma unroll
-      for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
+      AR_UNROLL for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
     }
     float sum = parts[0];
-#pragma unroll
-    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
+    AR_UNROLL for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
     return sum;
   }
   __device__ float dot(const Eighth<C> (&splat)[8]) const {
@@ -98,25 +85,20 @@ template <int C> struct ChannelShare {
     static_assert(kOwn == 2 || kOwn == 8);
     float weights[kPixels], sums[kOwn];
     spread(weight, weights);
-#pragma unroll
-    for (int k = 0; k < kOwn; ++k) {
+    AR_UNROLL for (int k = 0; k < kOwn; ++k) {
       sums[k] = weights[0] * v[0][k];
-#pragma unroll
-      for (int i = 1; i < kPixels; ++i) sums[k] = madd(weights[i], v[i][k], sums[k]);
+      AR_UNROLL for (int i = 1; i < kPixels; ++i) sums[k] = madd(weights[i], v[i][k], sums[k]);
     }
-#pragma unroll
-    for (int k = 0; k < kHalf; ++k) sums[k] += __shfl_xor_sync(kAllLanes, sums[k + kHalf], 4);
+    AR_UNROLL for (int k = 0; k < kHalf; ++k) sums[k] += __shfl_xor_sync(kAllLanes, sums[k + kHalf], 4);
     int count = kHalf;
-#pragma unroll
-    for (int offset = 2; offset > 0; offset /= 2) {
+    AR_UNROLL for (int offset = 2; offset > 0; offset /= 2) {
       const bool upper = lane_id() & offset;
       if (count == 1) {
         sums[0] += __shfl_xor_sync(kAllLanes, sums[0], offset);
         continue;
       }
       count /= 2;
-#pragma unroll
-      for (int k = 0; k < count; ++k) sums[k] = sum_of_pair(sums[k], sums[k + count], upper, offset);
+      AR_UNROLL for (int k = 0; k < count; ++k) sums[k] = sum_of_pair(sums[k], sums[k + count], upper, offset);
     }
     return sums[0];
   }
@@ -125,7 +107,7 @@ template <int C> struct ChannelShare {
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
 
-/// Channels [first, first + C) of kBatch splats, then zeros.
+/// Channels [first, first + C), then zeros.
 template <int kBatch, int C> struct GroupChannels {
   int32_t ids[kBatch];
   Eighth<C> values[kBatch][8];
@@ -138,13 +120,11 @@ template <int kBatch, int C> struct GroupChannels {
     const bool used = first + c < channels.count;
     for (int j0 = threadIdx.x / C; j0 < count; j0 += kRows * kAhead) {
       float x[kAhead];
-#pragma unroll
-      for (int i = 0; i < kAhead; ++i) {
+      AR_UNROLL for (int i = 0; i < kAhead; ++i) {
         const int j = j0 + kRows * i;
         x[i] = used && j < count && reach[j] ? channels.row(ids[j])[first + c] : 0;
       }
-#pragma unroll
-      for (int i = 0; i < kAhead; ++i) {
+      AR_UNROLL for (int i = 0; i < kAhead; ++i) {
         const int j = j0 + kRows * i;
         if (j < count) reinterpret_cast<float*>(values[j])[c] = x[i];
       }
@@ -184,8 +164,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
         const int j = from + take_first(left);
         TileSplatRef<F, 0> splat = stage.splats[j];
         float contribution = 0;
-#pragma unroll
-        for (int s = 0; s < S; ++s) {
+        AR_UNROLL for (int s = 0; s < S; ++s) {
           const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
           contribution += b.contribution;
           state.last[s] = b.mask ? k + j + 1 : state.last[s];
@@ -196,8 +175,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     }
   }
   float through = 0;
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
+  AR_UNROLL for (int s = 0; s < S; ++s) {
     through += abs(state.transmittance[s]);
     if (first == 0 && params.transmittance && pixel.inside) {
       params.transmittance[sample_index<F>(pixel, s)] = abs(state.transmittance[s]);
@@ -211,12 +189,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     params.alpha[pixel.index] = 1 - scale * through;
   float throughs[Share::kPixels];
   Share::spread(through, throughs);
-#pragma unroll
-  for (int i = 0; i < Share::kPixels; ++i) {
+  AR_UNROLL for (int i = 0; i < Share::kPixels; ++i) {
     const Pixel of_place(list, params.grid, pixel_of<F>(threadIdx.x / 32, Share::lane_of(i)));
     if (!of_place.inside || !writes_pixel<F>(Share::lane_of(i))) continue;
-#pragma unroll
-    for (int k = 0; k < Share::kOwn; ++k) {
+    AR_UNROLL for (int k = 0; k < Share::kOwn; ++k) {
       const int c = first + Share::channel(k);
       if (c >= params.channels.count) continue;
       params.image.plane(c, of_place.image)[of_place.index] =

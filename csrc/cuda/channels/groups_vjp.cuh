@@ -31,11 +31,10 @@ template <class F, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
   Share g;
-#pragma unroll
-  for (int i = 0; i < Share::kPixels; ++i) {
+  AR_UNROLL for (int i = 0; i < Share::kPixels; ++i) {
     const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, Share::lane_of(i)));
-#pragma unroll
-    for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] = sample_gradient<F>(params, pixel, first + Share::channel(k));
+    AR_UNROLL for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] =
+        sample_gradient<F>(params, pixel, first + Share::channel(k));
   }
   return g;
 }
@@ -58,8 +57,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   const Vec2<float> p = position_of<F>(warp, lane);
   const Pixel pixel(list, params.grid, pixel_of<F>(warp, lane));
   int last[S], own_last = 0;
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
+  AR_UNROLL for (int s = 0; s < S; ++s) {
     last[s] = pixel.inside ? params.last[sample_index<F>(pixel, s)] : 0;
     own_last = max(own_last, last[s]);
   }
@@ -67,8 +65,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   if (lane == 0) shared.last[warp] = own_last;
   __syncthreads();
   int end = 0;  // pairs up to the last that any pixel composited
-#pragma unroll
-  for (int b = 0; b < kSubtiles; ++b) end = max(end, shared.last[b]);
+  AR_UNROLL for (int b = 0; b < kSubtiles; ++b) end = max(end, shared.last[b]);
   // Pairs that nothing reached. Later groups of one width find the zeros of the first.
   if ((first == 0 || C == kSmallGroup) && !list.of_patch) {
     for (int k = end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
@@ -81,8 +78,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   float through = 0;  // scalar product of the gradient and the background
   if (kWithShape) {
     float background[Share::kOwn];
-#pragma unroll
-    for (int k = 0; k < Share::kOwn; ++k) {
+    AR_UNROLL for (int k = 0; k < Share::kOwn; ++k) {
       const int c = first + Share::channel(k);
       background[k] = c < channel_count ? params.background[c] : 0;
     }
@@ -94,8 +90,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   // Alpha is 1 - transmittance: like a channel whose background is -1.
   if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   float transmittance[S], farther[S];  // as in blend_sample_vjp, after the list
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
+  AR_UNROLL for (int s = 0; s < S; ++s) {
     transmittance[s] = pixel.inside ? params.transmittance[sample_index<F>(pixel, s)] : 1;
     farther[s] = through;
   }
@@ -115,8 +110,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
       if (k < k1) {
         const Splat<F, float> splat = load_splat<F>(params.splats, id);
         reach = subtile_reach<F>(splat, list.x0, list.y0);
-#pragma unroll
-        for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
+        AR_UNROLL for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
         if (reach) shared.splats[t] = {tile_terms(splat, list), {}};
         if (with_means) shared.mean_maps[t] = F::mean_map(splat.shape);
         shared.channels.ids[t] = id;
@@ -142,8 +136,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
         TileSplatRef<F, 0> splat = shared.splats[j];
         float alpha[S];
         bool any = false;
-#pragma unroll
-        for (int s = 0; s < S; ++s) {
+        AR_UNROLL for (int s = 0; s < S; ++s) {
           alpha[s] = F::alpha(splat.terms, p, s);
           any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
         }
@@ -156,8 +149,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
         }
         ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
         float weighted = 0, contribution = 0;
-#pragma unroll
-        for (int s = 0; s < S; ++s) {
+        AR_UNROLL for (int s = 0; s < S; ++s) {
           const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
           const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], farther[s]);
           if (kWithShape) F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, shape);
@@ -187,11 +179,9 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     for (int j = warp; j < count; j += kSubtiles) {
       const uint32_t of_warps = __ballot_sync(kAllLanes, shared.hits[lane % kSubtiles][j / 32] >> j % 32 & 1);
       const int32_t row = shared.rows[j];
-#pragma unroll
-      for (int v = lane; v < C + (kWithShape ? kShapeSums : 0); v += 32) {
+      AR_UNROLL for (int v = lane; v < C + (kWithShape ? kShapeSums : 0); v += 32) {
         float sum = 0;
-#pragma unroll
-        for (int w = 0; w < kSubtiles; ++w) {
+        AR_UNROLL for (int w = 0; w < kSubtiles; ++w) {
           if (of_warps >> w & 1) sum += shared.sums[w][j][v];
         }
         if (v >= C) {

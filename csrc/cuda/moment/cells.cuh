@@ -67,8 +67,7 @@ struct CellLayout {
   __device__ static int own_bit() { return kClaimed ? group() : int(threadIdx.x) / 32; }
 
   __device__ static float sum_lanes(float x) {
-#pragma unroll
-    for (int offset = 1; offset < kLanes; offset *= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+    AR_UNROLL for (int offset = 1; offset < kLanes; offset *= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
     return x;
   }
 };
@@ -78,7 +77,7 @@ template <class F, int kSide>
 using EvenLayout =
     std::conditional_t<(kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>, CellLayout<F::kSide, F::kSide, kSide>>;
 
-/// Checkpoint first + i - 1 of a tile is before pair i * spacing, i > 0. Tiles of a patch share the room of its list.
+/// Checkpoint first + i - 1 is before pair i * spacing, i > 0. Tiles of a patch share the room of its list.
 struct TileCheckpoints {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
@@ -91,7 +90,7 @@ struct TileCheckpoints {
     first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
-  /// The checkpoint before pair k, if `spacing` is kStateChunk.
+  /// Before pair k, if `spacing` is kStateChunk.
   template <class Samples> __device__ float* at(float* checkpoints, int k) const {
     return checkpoints + (first + k / kStateChunk - 1) * Samples::kCheckpoint;
   }
@@ -115,8 +114,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   Vec2<float> position[kCells];  ///< of the node, in [0, 1]^2
 
   __device__ explicit MovingSamples(bool inside) {
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < kCells; ++i) {
       transmittance[i] = inside && exists(i) ? 1.0f : -1.0f;
       position[i] = {0.5f, 0.5f};
     }
@@ -124,8 +122,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
   __device__ bool open() const {
     bool any = false;
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) any |= transmittance[i] > 0;
+    AR_UNROLL for (int i = 0; i < kCells; ++i) any |= transmittance[i] > 0;
     return any;
   }
 
@@ -137,8 +134,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
   __device__ void store(float* checkpoint, int k = 0, const int* last = nullptr) const {
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < kCells; ++i) {
       if (!exists(i) || !Layout::owns() || (last && k >= last[i])) continue;
       float* to = checkpoint + in_checkpoint(i);
       to[0] = abs(transmittance[i]);
@@ -148,8 +144,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   }
   /// Before pair k. A sample with last[i] <= k may have no checkpoint.
   __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
       position[i] = {0.5f, 0.5f};
       if (k == 0 || k >= last[i]) continue;
@@ -173,8 +168,8 @@ template <class F, class Layout> struct CellCorners {
 
   __device__ explicit CellCorners(Vec2<float> p) {
     const Vec2<float> corner = {F::kSide * (p.x - 0.5f), F::kSide * (p.y - 0.5f)};
-#pragma unroll
-    for (int i = 0; i < Layout::kCells; ++i) left[i] = corner.x + float((Layout::first_sample() + i) % F::kSide);
+    AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) left[i] =
+        corner.x + float((Layout::first_sample() + i) % F::kSide);
     top = corner.y + float(Layout::first_sample() / F::kSide);
   }
 
@@ -241,8 +236,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     [[maybe_unused]] Seen seen[kCells] = {};
     if constexpr (kVotes) {
       bool shows = false;
-#pragma unroll
-      for (int i = 0; i < kCells; ++i) {
+      AR_UNROLL for (int i = 0; i < kCells; ++i) {
         seen[i] = see(i);
         shows |= (seen[i].raw >= float(kAlphaMin)) & (samples.transmittance[i] > 0);
       }
@@ -259,8 +253,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
 
   __device__ void write(const BlendParams& params, int first) {
     float through = 0;
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < kCells; ++i) {
       if (!samples.exists(i) || !Layout::owns()) continue;
       through += abs(samples.transmittance[i]);
       if (!kKeep || !pixel.inside) continue;
@@ -269,12 +262,10 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
       params.last[index] = last[i];
     }
     through = Layout::sum_lanes(through);
-#pragma unroll
-    for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
+    AR_UNROLL for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
     if (!pixel.inside || Layout::first_sample() > 0 || !Layout::owns()) return;
     const float scale = 1.0f / F::kSamples;
-#pragma unroll
-    for (int c = 0; c < C; ++c) {
+    AR_UNROLL for (int c = 0; c < C; ++c) {
       if (first + c >= params.channels.count) break;
       params.image.plane(first + c, pixel.image)[pixel.index] =
           scale * sums.v[c] + scale * through * params.background[first + c];

@@ -23,8 +23,7 @@ template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float
 
 /// Bit b of lane l becomes bit l of lane b.
 __device__ inline uint32_t transpose_bits(uint32_t bits) {
-#pragma unroll
-  for (int s = 16; s > 0; s /= 2) {
+  AR_UNROLL for (int s = 16; s > 0; s /= 2) {
     const uint32_t lower = kAllLanes / ((1u << s) + 1);  // bits b with b & s = 0
     const bool upper = lane_id() & s;
     const uint32_t others = __shfl_xor_sync(kAllLanes, bits, s), keep = upper ? ~lower : lower;
@@ -50,16 +49,14 @@ __global__ void __launch_bounds__(MomentPolicy::kFilterPiece) filter_kernel(cons
     uint32_t reach[kWords] = {};
     if (k < list.count) {
       const Support<float> support = support_of(load_splat<F>(params.splats, list.splat(k)));
-#pragma unroll
-      for (int row = 0; row < kSide; ++row) {
+      AR_UNROLL for (int row = 0; row < kSide; ++row) {
         const float y = float(list.y0 + row);
         reach[row / kRowsOfWord] |= row_bits<kSide>(columns_of(support, y, y), float(list.x0))
                                     << row % kRowsOfWord * kSide;
       }
     }
     __syncthreads();  // all have read the last words
-#pragma unroll
-    for (int w = 0; w < kWords; ++w) {
+    AR_UNROLL for (int w = 0; w < kWords; ++w) {
       const uint32_t of_pixel = transpose_bits(reach[w]);
       if (kPixels % 32 == 0 || lane_id() < kPixels) words[32 * w + lane_id()][threadIdx.x / 32] = of_pixel;
     }
@@ -83,8 +80,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   template <class Layout> __device__ int collect(const float* splats_in, const TileList& list, int k) {
     const int lane = lane_id();
     uint32_t word = 0;
-#pragma unroll
-    for (int i = 0; i < Layout::kPixels; ++i) word |= words[i][lane];
+    AR_UNROLL for (int i = 0; i < Layout::kPixels; ++i) word |= words[i][lane];
     const int count = __popc(word), up_to = warp_inclusive_sum(count);
     int to = up_to - count;
     for (; word != 0; word &= word - 1) numbers[to++] = uint16_t(32 * lane + __ffs(word) - 1);
@@ -103,8 +99,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
     const int lane = 31 - lane_id(), number = from + lane < count ? numbers[from + lane] : 0;
     uint32_t mine = 0;
-#pragma unroll
-    for (int i = 0; i < Layout::kPixels; ++i) {
+    AR_UNROLL for (int i = 0; i < Layout::kPixels; ++i) {
       const bool reaches = from + lane < count && (words[i][number / 32] >> (number % 32) & 1);
       const uint32_t reached = __ballot_sync(kAllLanes, reaches);
       if (lane_id() / Layout::kLanes == i) mine = reached;
@@ -124,8 +119,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
   uint32_t words[kPixels];
   const auto read_words = [&](int k) {
     const int mine = k + 32 * lane;
-#pragma unroll
-    for (int i = 0; i < kPixels; ++i) {
+    AR_UNROLL for (int i = 0; i < kPixels; ++i) {
       const uint32_t* from =
           params.reach_words + pixel_words<F, Layout::kSide>(cut.first, list, Layout::pixel_number(i));
       words[i] = mine < list.count ? from[mine / 32] : 0u;
@@ -135,8 +129,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
-#pragma unroll
-    for (int i = 0; i < kPixels; ++i) {
+    AR_UNROLL for (int i = 0; i < kPixels; ++i) {
       constexpr uint32_t kFirst = kAllLanes >> (32 - Layout::kLanes);
       stage.words[i][lane] = open & kFirst << (i * Layout::kLanes) ? words[i] : 0u;
     }

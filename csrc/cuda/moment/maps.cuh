@@ -138,10 +138,9 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   Adjoint adjoint = memory.template get<Adjoint>(first + segment);
   for (; segment > 1; segment -= kAhead) {
     SegmentMap maps[kAhead];
-#pragma unroll
-    for (int i = 0; i < kAhead; ++i) maps[i] = memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
-#pragma unroll
-    for (int i = 0; i < kAhead; ++i) {
+    AR_UNROLL for (int i = 0; i < kAhead; ++i) maps[i] =
+        memory.template get<SegmentMap>(first + max(segment - 1 - i, 1));
+    AR_UNROLL for (int i = 0; i < kAhead; ++i) {
       if (segment - 1 - i < 1) return;
       adjoint = maps[i](adjoint);
       memory.put(first + segment - 1 - i, adjoint);

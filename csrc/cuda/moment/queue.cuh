@@ -33,16 +33,14 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
       if (lane_id() == 0) of_warp[threadIdx.x / 32] = x;
       __syncthreads();
       x = of_warp[0];
-#pragma unroll
-      for (int warp = 1; warp < kWarpsOfPixel; ++warp) x += of_warp[warp];
+      AR_UNROLL for (int warp = 1; warp < kWarpsOfPixel; ++warp) x += of_warp[warp];
     }
     return x;
   }
   /// Over sharers().
   __device__ static int max_of_sharers(int x) {
-#pragma unroll
-    for (int offset = 1; offset < kAhead; offset *= 2)
-      x = max(x, shuffle(x, first_sharer() + (ahead() + offset) % kAhead));
+    AR_UNROLL for (int offset = 1; offset < kAhead; offset *= 2) x =
+        max(x, shuffle(x, first_sharer() + (ahead() + offset) % kAhead));
     return x;
   }
 };
@@ -62,8 +60,7 @@ template <int kSegment> struct CheckpointsAhead {
   float* to;
 
   template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
-#pragma unroll 1
-    while (pair <= k) {
+    AR_NO_UNROLL while (pair <= k) {
       samples.store(to);
       const int chunks = pair < kSegment ? 1 : kSegment / kStateChunk;
       pair += chunks * kStateChunk;
@@ -106,8 +103,7 @@ template <class Layout> struct PairQueues {
       const int before = next + kBits * lane - 1;
       const int found = __popc(mine);
       int up_to = found;
-#pragma unroll
-      for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
+      AR_UNROLL for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
         const int of_lanes_before = shuffle_up(up_to, offset);
         if (lane >= offset) up_to += of_lanes_before;
       }

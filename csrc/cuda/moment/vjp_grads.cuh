@@ -30,8 +30,7 @@ template <class F, int C> struct SampleGrad {
   __device__ void read(const BlendVjpParams& params, const Pixel& pixel, int first, WantedSums<C> wanted) {
     with_others = wanted.others;
     through = 0;
-#pragma unroll
-    for (int c = 0; c < C; ++c) {
+    AR_UNROLL for (int c = 0; c < C; ++c) {
       channels.v[c] = sample_gradient<F>(params, pixel, first + c);
       if (first + c < params.channels.count) through += channels.v[c] * params.background[first + c];
     }
@@ -47,8 +46,7 @@ template <class F, int C> struct SampleGrad {
   template <class Id>
   __device__ float times(const Values<C>& color, const BlendVjpParams& params, const Pixel& pixel, Id&& id) const {
     float product = channels.v[0] * color.v[0];
-#pragma unroll
-    for (int c = 1; c < C; ++c) product = madd(channels.v[c], color.v[c], product);
+    AR_UNROLL for (int c = 1; c < C; ++c) product = madd(channels.v[c], color.v[c], product);
     if (with_others) {
       const float* row = params.channels.row(id());
       for (int c = C; c < params.channels.count; ++c)
@@ -63,8 +61,7 @@ template <class F, class Layout> struct SamplesLast {
   int samples[Layout::kCells], warp = 0;
 
   __device__ SamplesLast(const int32_t* last, const Pixel& pixel) {
-#pragma unroll
-    for (int i = 0; i < Layout::kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) {
       const int sample = Layout::first_sample() + i;
       samples[i] = pixel.inside && sample < F::kSamples ? last[sample * pixel.image + pixel.index] : 0;
       warp = max(warp, samples[i]);
@@ -76,8 +73,7 @@ template <class F, class Layout> struct SamplesLast {
     if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
     __syncthreads();
     int block = 0;
-#pragma unroll
-    for (int w = 0; w < Layout::kWarps; ++w) block = max(block, of_warps[w]);
+    AR_UNROLL for (int w = 0; w < Layout::kWarps; ++w) block = max(block, of_warps[w]);
     return block;
   }
 };
@@ -105,8 +101,7 @@ template <class F, int C, class Layout, bool kTogether = kSamplesTogether<Layout
   /// After all splats there is only the background.
   __device__ void begin(const BlendVjpParams& params, int first, WantedSums<C> wanted) {
     grad.read(params, pixel, first, wanted);
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
+    AR_UNROLL for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
   }
 };
 

@@ -61,8 +61,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   const auto map_of = [&](int i) {
     return MapMemory<F, Layout::kTilePixels>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
   };
-#pragma unroll
-  for (int i = 0; i < Layout::kCells; ++i) {
+  AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) {
     if (last[i] <= k1) continue;
     lane.adjoint[i] = k1 == end ? map_of(i).template get<Adjoint>(segment.number + 1)
                                 : map_of(i).template get<Adjoint>(segment.number, kCarried);
@@ -72,9 +71,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     lane.samples.load(stored.at<typename Lane::Samples>(params.checkpoints, k0 + from), k0 + from, last);
   });
   if (k0 == begin) return;
-#pragma unroll
-  for (int i = 0; i < Layout::kCells; ++i)
-    if (last[i] > k0) map_of(i).put(segment.number, lane.adjoint[i], kCarried);
+  AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) if (last[i] > k0) map_of(i).put(segment.number, lane.adjoint[i],
+                                                                                     kCarried);
 }
 
 /// Reads the channels [first, first + C). `in_shared`: of EarlierPositions, which follow Shared in memory.

@@ -67,7 +67,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
 };
 
-/// Clears the rows of pairs that no sample composited.
+/// Of pairs that no sample composited.
 template <int kThreads>
 __device__ void clear_pairs(const BlendVjpParams& params, const TileList& list, int begin, int end, int first) {
   if (first % kChannelGroup != 0 || list.of_patch) return;
@@ -84,8 +84,7 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   float values[C <= kFewChannels ? 6 + C : 8] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                                                  shape.shape.xy, shape.shape.yy, grad.weighted};
   if constexpr (C <= kFewChannels) {
-#pragma unroll
-    for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
+    AR_UNROLL for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
     *sums = sum_values(values);  // by all lanes: cheaper than a test
   } else {
     static_assert(C == 8);

@@ -43,23 +43,19 @@ template <class Layout> struct EarlierPositions {
   }
   /// kShared: n < in_shared.
   template <bool kShared> __device__ void put(int n, const Positions& positions) {
-#pragma unroll
-    for (int i = 0; i < kCells; i += kTogether) {
+    AR_UNROLL for (int i = 0; i < kCells; i += kTogether) {
       Together together;
-#pragma unroll
-      for (int j = 0; j < kTogether; ++j) together.of[j] = positions[i + j];
+      AR_UNROLL for (int j = 0; j < kTogether; ++j) together.of[j] = positions[i + j];
       (kShared ? shared()[n][i / kTogether][lane_id()] : local[n][i / kTogether]) = together;
     }
   }
   __device__ void get(int n, Positions& positions) const {
     const bool is_shared = n < in_shared;
-#pragma unroll
-    for (int i = 0; i < kCells; i += kTogether) {
+    AR_UNROLL for (int i = 0; i < kCells; i += kTogether) {
       Together together;
       if (is_shared) together = shared()[n][i / kTogether][lane_id()];
       if (!is_shared) together = local[n][i / kTogether];
-#pragma unroll
-      for (int j = 0; j < kTogether; ++j) positions[i + j] = together.of[j];
+      AR_UNROLL for (int j = 0; j < kTogether; ++j) positions[i + j] = together.of[j];
     }
   }
 };
@@ -79,8 +75,7 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, VjpLane<F, C, L
     const auto& terms = Stage::Lists::splat_of(stage.splats, entry).terms;
     if constexpr (kKeeps) earlier->template put<decltype(is_shared)::value>(n, samples.position);
     bool any = false;
-#pragma unroll
-    for (int i = 0; i < Layout::kCells; ++i) {
+    AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) {
       const auto [z, raw] = lane.corners.see(terms, i, samples.position[i]);
       any |= replay_placed_sample<F>(terms, z, raw, k0 + int(entry) < lane.last.samples[i], UnitCell<F::kSide>(),
                                      samples.transmittance[i], samples.position[i]);
@@ -117,8 +112,7 @@ __device__ void batch_vjp(const BlendVjpParams& params, Shared& shared, int grou
       Vec2<float> positions[Layout::kCells];
       earlier.get(n, positions);
       MovingBlendGrad<float> of_cells = no_moving_blend_grad<float>();
-#pragma unroll
-      for (int i = 0; i < Layout::kCells; ++i) {
+      AR_UNROLL for (int i = 0; i < Layout::kCells; ++i) {
         const auto [z, raw] = lane.corners.see(splat.terms, i, positions[i]);
         const bool composited = raw >= float(kAlphaMin) && k0 + j < lane.last.samples[i];
         add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, positions[i],
@@ -143,8 +137,7 @@ struct MovingVjpShared : VjpBatch<F, C, Layout, Layout::kCells == 1 ? 2 * kState
 
   __device__ float total(int j, int v) const {
     float sum = 0;
-#pragma unroll
-    for (int w = 0; w < Layout::kWarps; ++w) {
+    AR_UNROLL for (int w = 0; w < Layout::kWarps; ++w) {
       if (this->is_hit(w, j)) sum += this->inside[w][j][v];
     }
     return sum;

@@ -49,8 +49,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
         constexpr int kCells = Layout::kCells;
         const int listed = stage.lists.list(stage.reach, from, min(count, from + kListed));
         int shown[kCells];  // last entry that each sample shows
-#pragma unroll
-        for (int i = 0; i < kCells; ++i) shown[i] = -1;
+        AR_UNROLL for (int i = 0; i < kCells; ++i) shown[i] = -1;
         for (int n = 0; n < listed; n += MomentPolicy::kBetweenVotes) {
           if (!__any_sync(kAllLanes, blend.samples.open())) break;
           stage.lists.for_each(n, min(listed, n + MomentPolicy::kBetweenVotes), [&](uint32_t entry) {
@@ -58,9 +57,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
             blend.add(splat, int(entry), shown);
           });
         }
-#pragma unroll
-        for (int i = 0; kKeep && i < kCells; ++i)
-          if (shown[i] >= 0) blend.last[i] = k + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
+        AR_UNROLL for (int i = 0; kKeep && i < kCells; ++i) if (shown[i] >= 0) blend.last[i] =
+            k + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
         __syncwarp();  // all have read the list
       } else {
         const bool reaches = stage.reach[from + 31 - lane_id()] >> (threadIdx.x / 32) & 1;

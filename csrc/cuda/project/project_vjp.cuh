@@ -26,15 +26,11 @@ struct SplatSums {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
     float4 v[kRows][kQuads];
-#pragma unroll
-    for (int r = 0; r < kRows; ++r) {
-#pragma unroll
-      for (int q = 0; q < kQuads; ++q) v[r][q] = r < count ? quads[r * kQuads + q] : float4{0, 0, 0, 0};
+    AR_UNROLL for (int r = 0; r < kRows; ++r) {
+      AR_UNROLL for (int q = 0; q < kQuads; ++q) v[r][q] = r < count ? quads[r * kQuads + q] : float4{0, 0, 0, 0};
     }
-#pragma unroll
-    for (int r = 0; r < kRows; ++r) {
-#pragma unroll
-      for (int q = 0; q < kQuads; ++q) {
+    AR_UNROLL for (int r = 0; r < kRows; ++r) {
+      AR_UNROLL for (int q = 0; q < kQuads; ++q) {
         value[4 * q] += v[r][q].x, value[4 * q + 1] += v[r][q].y;
         value[4 * q + 2] += v[r][q].z, value[4 * q + 3] += v[r][q].w;
       }
@@ -64,8 +60,7 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
     const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
     SplatSums part = {};
     for (int q = lane_id(); q < count; q += 32) part.add<1>(row(first + q), 1);
-#pragma unroll
-    for (int v = 0; v < kPairGradWidth; ++v) {
+    AR_UNROLL for (int v = 0; v < kPairGradWidth; ++v) {
       const float total = warp_sum(part.value[v]);
       if (lane_id() == source) sums.value[v] = total;
     }
@@ -171,7 +166,7 @@ struct FromRows {
   }
 };
 
-/// Adds gradients, of coefficients by way of shared memory.
+/// Coefficients go by way of shared memory.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
   __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
@@ -229,8 +224,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads,
   if (out.shs) rows.template store<Out::kAdd>(out.shs + first * stride, stride, n);
   if (!Cam::kFull || !camera_grads) return;
   const float* values = &camera_grad.view_x.x;
-#pragma unroll
-  for (int k = 0; k < kCameraGradWidth; ++k) {
+  AR_UNROLL for (int k = 0; k < kCameraGradWidth; ++k) {
     const float total = warp_sum(values[k]);
     if (lane == 0) camera_grads[k] = total;
   }
@@ -251,7 +245,6 @@ __global__ void __launch_bounds__(ProjectPolicy::kZeroThreads,
   }
 }
 
-/// A block per number.
 __global__ void __launch_bounds__(ProjectPolicy::kSumThreads)
     sum_camera_grads_kernel(const CameraGradSums<float> params) {
   wait_for_earlier_kernels();
@@ -311,8 +304,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) sum_few_channels_kern
   const PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
   if (i >= n) return;
-#pragma unroll
-  for (int c = 0; c < kFewChannels; ++c) {
+  AR_UNROLL for (int c = 0; c < kFewChannels; ++c) {
     const float sum = sums.value[c == 3 ? kPairFourthChannel : kPairChannels + c];
     if (c < params.count) params.dL_dchannels[i * params.stride + params.first + c] = sum;
   }
@@ -339,13 +331,11 @@ __global__ void __launch_bounds__(ProjectPolicy::kSumThreads) sum_channels_kerne
     float4 sum = {0, 0, 0, 0};
     for (int q = row; q < of_splat.count; q += kAhead * step) {
       float4 x[kAhead];
-#pragma unroll
-      for (int k = 0; k < kAhead; ++k) {
+      AR_UNROLL for (int k = 0; k < kAhead; ++k) {
         const int at = q + k * step;
         x[k] = at < of_splat.count ? quads[int64_t(at) * kQuads] : float4{0, 0, 0, 0};
       }
-#pragma unroll
-      for (int k = 0; k < kAhead; ++k) add(sum, x[k]);
+      AR_UNROLL for (int k = 0; k < kAhead; ++k) add(sum, x[k]);
     }
     return sum;
   };
@@ -362,8 +352,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kSumThreads) sum_channels_kerne
       *reinterpret_cast<float4*>(to) = sum;
     } else {
       const float values[4] = {sum.x, sum.y, sum.z, sum.w};
-#pragma unroll
-      for (int c = 0; c < 4; ++c) {
+      AR_UNROLL for (int c = 0; c < 4; ++c) {
         if (c < left) to[c] = values[c];
       }
     }

@@ -41,8 +41,7 @@ template <int kDegree> struct ShRows {
 #pragma unroll 8
     for (int row = 0; row < 32; ++row, from += 3 * stride, to += kStride) {
       if (!(lanes >> row & 1)) continue;
-#pragma unroll
-      for (int e = 0; e < 3 * kCount; e += 32) {
+      AR_UNROLL for (int e = 0; e < 3 * kCount; e += 32) {
         if (e < here) copy_async(to + e, from + e);
       }
     }
@@ -52,8 +51,7 @@ template <int kDegree> struct ShRows {
     __syncwarp();
     if (stride == kPacked && in_quads(base)) {
       auto* to = reinterpret_cast<float4*>(base);
-#pragma unroll
-      for (int e = 0; e < kQuads; ++e) {
+      AR_UNROLL for (int e = 0; e < kQuads; ++e) {
         const int k = e * 32 + lane_id(), row = k / kQuads;
         if (row >= rows) continue;
         float4 stored = *quad(row, k % kQuads);
@@ -90,13 +88,11 @@ template <int kDegree> struct ShRows {
   /// With offsets that the compiler knows.
   __device__ void begin_load_packed(const Vec3<float>* base, uint32_t lanes) {
     const auto* from = reinterpret_cast<const float4*>(base) + lane_id();
-#pragma unroll
-    for (int step = 0; step < kSteps; ++step) {
+    AR_UNROLL for (int step = 0; step < kSteps; ++step) {
       const int k = 32 * step + lane_id();
       float4* to = quad(k / kQuads, k % kQuads);
       const uint32_t mine = lanes >> k / kQuads;
-#pragma unroll
-      for (int row = 0; row < 32; row += kRowsOfStep) {
+      AR_UNROLL for (int row = 0; row < 32; row += kRowsOfStep) {
         if (mine >> row & 1) copy_async(to + row * kStride / 4, from + 32 * step + row * kQuads);
       }
     }

@@ -39,8 +39,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kFro
     k += count;
     if (several && k % kLength == 0 && k < list.count) {
       if constexpr (kKeep) {
-#pragma unroll
-        for (int s = 0; s < S; ++s) checkpoints.kept(written, s) = {state.channels[s], state.transmittance[s]};
+        AR_UNROLL for (int s = 0; s < S; ++s)
+            checkpoints.kept(written, s) = {state.channels[s], state.transmittance[s]};
       }
       ++written;
       total += state.total();
@@ -52,16 +52,14 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kFro
     params.tile_open[tile] = more;
     if (more) params.open_tiles[atomicAdd(&counts.open_tiles, 1)] = tile;
   }
-#pragma unroll
-  for (int s = 0; s < S; ++s)
-    if (kKeep && pixel.inside) params.last[sample_index<F>(pixel, s)] = state.last[s];
+  AR_UNROLL for (int s = 0; s < S; ++s) if (kKeep && pixel.inside) params.last[sample_index<F>(pixel, s)] =
+      state.last[s];
   if (!more) {
     total += state.total();
     store_pixel<F>(params, pixel, total, state.transmittance);
     if constexpr (kKeep) {
       const Values<C> background = background_of<C>(params);
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
+      AR_UNROLL for (int s = 0; s < S; ++s) {
         Values<C> farther = times(abs(state.transmittance[s]), background);
         farther += state.channels[s];
         accumulate_farther<8>(checkpoints, 0, written, s, farther);
@@ -69,8 +67,7 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kFro
     }
   } else if constexpr (!kKeep) {
     // The tail begins at the checkpoint of the last front chunk.
-#pragma unroll
-    for (int s = 0; s < S; ++s) checkpoints.transmittance(front_length - 1, s) = state.transmittance[s];
+    AR_UNROLL for (int s = 0; s < S; ++s) checkpoints.transmittance(front_length - 1, s) = state.transmittance[s];
     checkpoints.set_total(front_length - 1, total);
   }
 }

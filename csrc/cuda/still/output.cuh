@@ -42,14 +42,12 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
       return kept(chunk, s).channels;
     } else {
       Values<C> values;
-#pragma unroll
-      for (int c = 0; c < C; ++c) values.v[c] = plane(chunk, S + c);
+      AR_UNROLL for (int c = 0; c < C; ++c) values.v[c] = plane(chunk, S + c);
       return values;
     }
   }
   __device__ void set_total(int chunk, const Values<C>& values) const {
-#pragma unroll
-    for (int c = 0; c < C; ++c) plane(chunk, S + c) = values.v[c];
+    AR_UNROLL for (int c = 0; c < C; ++c) plane(chunk, S + c) = values.v[c];
   }
 };
 
@@ -76,8 +74,8 @@ struct TransmittancePlanes {
 
 template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   Values<C> background;
-#pragma unroll
-  for (int c = 0; c < C; ++c) background.v[c] = C == 3 || c < params.channels.count ? params.background[c] : 0;
+  AR_UNROLL for (int c = 0; c < C; ++c) background.v[c] =
+      C == 3 || c < params.channels.count ? params.background[c] : 0;
   return background;
 }
 
@@ -86,19 +84,16 @@ template <class Samples, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
                             const float (&transmittance)[Samples::kSamples]) {
   float through = 0;
-#pragma unroll
-  for (int s = 0; s < Samples::kSamples; ++s) {
+  AR_UNROLL for (int s = 0; s < Samples::kSamples; ++s) {
     through += abs(transmittance[s]);
     if (params.transmittance && pixel.inside)
       params.transmittance[sample_index<Samples>(pixel, s)] = abs(transmittance[s]);
   }
   through = sum_of_pixel<Samples>(through);
-#pragma unroll
-  for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<Samples>(total.v[c]);
+  AR_UNROLL for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<Samples>(total.v[c]);
   if (!pixel.inside || !writes_pixel<Samples>(lane_id())) return;
   const float scale = kSampleShare<Samples>;
-#pragma unroll
-  for (int c = 0; c < C; ++c) {
+  AR_UNROLL for (int c = 0; c < C; ++c) {
     if (C > 3 && c >= params.channels.count) break;
     params.image.plane(c, pixel.image)[pixel.index] = scale * total.v[c] + scale * through * params.background[c];
   }
@@ -112,12 +107,10 @@ __device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoin
                                    Values<C> farther) {
   for (int last = end - 1; last >= first; last -= kBatch) {
     Values<C> own[kBatch];
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) {
+    AR_UNROLL for (int k = 0; k < kBatch; ++k) {
       if (last - k >= first) own[k] = checkpoints.kept(last - k, s).channels;
     }
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) {
+    AR_UNROLL for (int k = 0; k < kBatch; ++k) {
       if (last - k < first) continue;
       checkpoints.kept(last - k, s).channels = farther;
       farther += own[k];

@@ -46,8 +46,7 @@ __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec
       if constexpr (kSets == 1) {
         add_samples<F::kSamples>(state.channels[0], splat.channels, composite);
       } else {
-#pragma unroll
-        for (int s = 0; s < F::kSamples; ++s) {
+        AR_UNROLL for (int s = 0; s < F::kSamples; ++s) {
           const Blended<float> b = composite(s);
           if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
         }

@@ -33,20 +33,18 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
   const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane_id());
   for_each_tail_chunk(params, [&](const TileChunk& tail, const TileList& list, int end) {
     float transmittance[S];
-#pragma unroll
-    for (int s = 0; s < S; ++s) transmittance[s] = 1;
+    AR_UNROLL for (int s = 0; s < S; ++s) transmittance[s] = 1;
     for (int k = tail.chunk * kChunkLength; k < end; k += stage.kBatch) {
       __syncthreads();
       const int count = stage.load(params.splats, params.channels, list, k, end);
       __syncthreads();
       stage.for_each_listed(0, stage.list_reached(count), [&](TileSplatRef<F, 0> splat, auto) {
-#pragma unroll
-        for (int s = 0; s < S; ++s) transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
+        AR_UNROLL for (int s = 0; s < S; ++s) transmittance[s] -=
+            transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
       });
     }
     const TransmittancePlanes planes(params, S, tail.tile, int(threadIdx.x));
-#pragma unroll
-    for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
+    AR_UNROLL for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
   });
 }
 
@@ -73,19 +71,16 @@ __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params,
     const TransmittancePlanes planes(params, samples, tile, item % kTailParts * 32 + lane_id());
     float transmittance = planes.at(front - 1, s), next[kBatch];
     const auto load = [&](int first) {
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) {
+      AR_UNROLL for (int k = 0; k < kBatch; ++k) {
         if (first + k < chunks) next[k] = planes.at(first + k, s);
       }
     };
     load(front);
     for (int first = front; first < chunks; first += kBatch) {
       float through[kBatch];
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) through[k] = next[k];
+      AR_UNROLL for (int k = 0; k < kBatch; ++k) through[k] = next[k];
       load(first + kBatch);  // after stores it would wait
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) {
+      AR_UNROLL for (int k = 0; k < kBatch; ++k) {
         if (first + k >= chunks) break;
         planes.at(first + k, s) = transmittance;
         if (transmittance > 0) transmittance *= through[k];
@@ -109,8 +104,7 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
     PixelState<S, C, kSets> state;
     state.start(false);
     bool started[S];
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
+    AR_UNROLL for (int s = 0; s < S; ++s) {
       const float transmittance = checkpoints.transmittance(tail.chunk, s);
       started[s] = transmittance > 0;
       if (started[s]) state.transmittance[s] = transmittance;
@@ -123,8 +117,7 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
       k += count;
     }
     const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
+    AR_UNROLL for (int s = 0; s < S; ++s) {
       const float transmittance = started[s] ? state.transmittance[s] : 0;
       if constexpr (kKeep) {
         checkpoints.kept(tail.chunk, s) = {state.channels[s], transmittance};
@@ -161,42 +154,36 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
     if (warp == 0) begin = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
+    AR_UNROLL for (int s = 0; s < S; ++s) {
       const bool has_channels = kKeep || s == 0;
       Values<C> sum = {};
       float last = 0;  // transmittance after the last chunk that the sample reached
       for (int first = begin; first < end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];
-#pragma unroll
-        for (int k = 0; k < kBatch; ++k) {
+        AR_UNROLL for (int k = 0; k < kBatch; ++k) {
           ends[k] = 0;
           if (first + k >= end) continue;
           if (has_channels) own[k] = checkpoints.channels(first + k, s);
           ends[k] = checkpoints.transmittance(first + k, s);
         }
-#pragma unroll
-        for (int k = 0; k < kBatch; ++k) {
+        AR_UNROLL for (int k = 0; k < kBatch; ++k) {
           if (has_channels && first + k < end) sum += own[k];
           if (ends[k] != 0) last = ends[k];
         }
       }
       lasts[warp][lane] = last;
-#pragma unroll
-      for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
+      AR_UNROLL for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
       __syncthreads();
       for (int w = 0; w < kWarps; ++w) {
         if (lasts[w][lane] != 0) last = lasts[w][lane];
-#pragma unroll
-        for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
+        AR_UNROLL for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
       }
       transmittance[s] = last;
       if constexpr (kKeep) {
         Values<C> farther = times(abs(last), background);
         for (int w = kWarps - 1; w > warp; --w) {
-#pragma unroll
-          for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
+          AR_UNROLL for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }
         accumulate_farther<kBatch>(checkpoints, begin, end, s, farther);
       }

@@ -89,16 +89,14 @@ template <class F> constexpr int visited_subtile(int k) {
 template <class F, int C, class Visit>
 __device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> of_first, Visit&& visit) {
   if constexpr (kTakesTwo<F, C>) {
-#pragma unroll
-    for (int q = 0; q < kSubtiles / 2; ++q) {
+    AR_UNROLL for (int q = 0; q < kSubtiles / 2; ++q) {
       const int upper = visited_subtile<F>(2 * q), lower = visited_subtile<F>(2 * q + 1);
       if (!(subtiles & (1u << upper | 1u << lower))) continue;
       visit(upper, position_in<F>(upper, of_first));
       visit(lower, position_in<F>(lower, of_first));
     }
   } else if constexpr (kUnrollsSubtiles<F, C>) {
-#pragma unroll
-    for (int k = 0; k < kSubtiles; ++k) {
+    AR_UNROLL for (int k = 0; k < kSubtiles; ++k) {
       const int b = visited_subtile<F>(k);
       if (subtiles >> b & 1) visit(b, position_in<F>(b, of_first));
     }
@@ -117,8 +115,7 @@ __device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> of
 
 template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
   float sum = a.v[0] * b.v[0];
-#pragma unroll
-  for (int c = 1; c < C; ++c) sum = sum + a.v[c] * b.v[c];
+  AR_UNROLL for (int c = 1; c < C; ++c) sum = sum + a.v[c] * b.v[c];
   return sum;
 }
 

@@ -16,8 +16,7 @@ struct PairSums {
 
     __device__ void put(const float (&values)[kValues]) {
       const int lane = lane_id();
-#pragma unroll
-      for (int group = 0; group < 2; ++group) {
+      AR_UNROLL for (int group = 0; group < 2; ++group) {
         const float* v = values + 4 * group;
         eight[group][lane] = {v[0], v[1], v[2], v[3]};
       }
@@ -42,13 +41,11 @@ struct PairSums {
     const int lane = lane_id(), odd = lane / 4 % 2;
     const Pair& pair = pairs[lane / 4];
     const Values<4> half = pair.sum_from<2>(lane / 2 % 2, lane % 2);
-#pragma unroll
-    for (int v = 0; v < 4; ++v) four[v] = half.v[v] + __shfl_xor_sync(kAllLanes, half.v[v], 1);
+    AR_UNROLL for (int v = 0; v < 4; ++v) four[v] = half.v[v] + __shfl_xor_sync(kAllLanes, half.v[v], 1);
     // Of lanes below 16 and of the others, in either order.
     const float4 a = pair.ninth[lane % 4 * 2 + odd], b = pair.ninth[lane % 4 * 2 + 1 - odd];
     ninth = ((a.x + b.x) + (a.z + b.z)) + ((a.y + b.y) + (a.w + b.w));
-#pragma unroll
-    for (int offset = 2; offset > 0; offset /= 2) ninth += __shfl_xor_sync(kAllLanes, ninth, offset);
+    AR_UNROLL for (int offset = 2; offset > 0; offset /= 2) ninth += __shfl_xor_sync(kAllLanes, ninth, offset);
   }
 };
 

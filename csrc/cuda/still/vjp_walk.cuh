@@ -37,12 +37,11 @@ template <class F, class Batch>
 __device__ __forceinline__ int find_last(const BlendVjpParams& params, const VjpChunk& chunk, Batch& batch) {
   const int lane = lane_id();
   int tile_last = 0;
-#pragma unroll
-  for (int b = 0; b < kSubtiles; ++b) {
+  AR_UNROLL for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = chunk.pixel_index<F>(b, lane);
     int last = 0;
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s) last = max(last, i < 0 ? 0 : params.last[sample_index<F>(chunk.image, i, s)]);
+    AR_UNROLL for (int s = 0; s < F::kSamples; ++s) last =
+        max(last, i < 0 ? 0 : params.last[sample_index<F>(chunk.image, i, s)]);
     last = warp_max(last);
     if (lane == 0) batch.subtile_last[b] = last;
     tile_last = max(tile_last, last);
@@ -57,24 +56,20 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   const int lane = lane_id();
   const float* dL_dplanes[C];  // with three channels none is null
   Values<C> background;
-#pragma unroll
-  for (int c = 0; c < C; ++c) {
+  AR_UNROLL for (int c = 0; c < C; ++c) {
     const bool used = C == 3 || c < params.channels.count;
     dL_dplanes[c] = C == 3 ? params.dL_dimage.first + c * chunk.image
                     : used ? params.dL_dimage.plane(c, chunk.image)
                            : nullptr;
     background.v[c] = used ? params.background[c] : 0;
   }
-#pragma unroll
-  for (int b = 0; b < kSubtiles; ++b) {
+  AR_UNROLL for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = chunk.pixel_index<F>(b, lane);
     const float scale = i < 0 ? 0 : kSampleShare<F>;
     Values<C> g;
-#pragma unroll
-    for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && (C == 3 || dL_dplanes[c]) ? scale * dL_dplanes[c][i] : 0;
+    AR_UNROLL for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && (C == 3 || dL_dplanes[c]) ? scale * dL_dplanes[c][i] : 0;
     pixels.set_gradient(b, g);
-#pragma unroll
-    for (int s = 0; s < F::kSamples; ++s) {
+    AR_UNROLL for (int s = 0; s < F::kSamples; ++s) {
       const int last = i < 0 ? 0 : params.last[sample_index<F>(chunk.image, i, s)];
       float transmittance = 1, behind = 0;
       if (final) {
@@ -119,8 +114,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
         row = list_.slot(k);
         own = load_splat<F>(params_.splats, id);
         reach = subtile_reach<F>(own, list_.x0, list_.y0);
-#pragma unroll
-        for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= batch_.subtile_last[b]) << b);
+        AR_UNROLL for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= batch_.subtile_last[b]) << b);
         if (kMeans) mean_map = F::mean_map(own.shape);
         if (reach == 0 && !list_.of_patch) clear_pair(params_, row);
       }
@@ -197,8 +191,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     if (C > 3) g_color = madd(g.w, splat.channels.v[C - 1], g_color);
     float contribution = 0;
     ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
+    AR_UNROLL for (int s = 0; s < S; ++s) {
       const float alpha = F::alpha(splat.terms, p, s);
       // `&`, because to read `last` after the first comparison would be to wait.
       const bool mask = (alpha >= float(kAlphaMin)) & (at < pixels_.last_of(s, b, g));
@@ -212,8 +205,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
       weighted += grad.of_alpha.weighted;
     }
-#pragma unroll
-    for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);
+    AR_UNROLL for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);
     if (kMeans) {
       const Vec2<float> offset = {sum_of_pixel<F>(of_pixel.offset.x), sum_of_pixel<F>(of_pixel.offset.y)};
       const Vec2<float> of_mean = mean_sums_of(kKind, chunk_.size, transform_transposed(mean_map, offset));
@@ -227,8 +219,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
                                             const Values<C>& channels, To& to) {
     float values[kSumCount] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                                shape.shape.xy, shape.shape.yy, weighted};
-#pragma unroll
-    for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
+    AR_UNROLL for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
     if constexpr (kHoldsSamples<C>) {
       to.put(values);
     } else {
@@ -254,8 +245,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       *reinterpret_cast<float4*>(place) = {four[0], four[1], four[2], four[3]};
       if (lane_ % 4 == 0) row[8] = ninth;
     } else if (lane_ % 2 == 0) {
-#pragma unroll
-      for (int v = 0; v < 4; ++v) atomicAdd(place + v, four[v]);
+      AR_UNROLL for (int v = 0; v < 4; ++v) atomicAdd(place + v, four[v]);
       if (lane_ % 4 == 0) atomicAdd(row + 8, ninth);
     }
   }

@@ -54,8 +54,7 @@ __device__ inline int listed_tile(const BlendVjpParams& params, int chunk) {
 /// Zeros in `row` of pair_grads, for a pair that no sample composites.
 __device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
   auto* numbers = reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth);
-#pragma unroll
-  for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
+  AR_UNROLL for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
 }
 
 inline constexpr int kClearThreads = kChannelGroup / 4;

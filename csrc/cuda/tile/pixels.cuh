@@ -42,8 +42,7 @@ template <class F> __device__ Vec2<float> position_of(int b, int lane) {
   Vec2<float> of_first = pixel_of<F>(0, lane);
   if constexpr (F::kLanes > 1) {
     Vec2<float> node = {0, 0};
-#pragma unroll
-    for (int s = 0; s < F::kLanes; ++s) {
+    AR_UNROLL for (int s = 0; s < F::kLanes; ++s) {
       if (lane % F::kLanes == s) node = {float(F::node(s).x), float(F::node(s).y)};
     }
     of_first = of_first + node;
@@ -74,8 +73,7 @@ template <class F> __device__ int64_t sample_index(const Pixel& pixel, int s) {
 }
 
 template <class F> __device__ float sum_of_pixel(float x) {
-#pragma unroll
-  for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+  AR_UNROLL for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
   return x;
 }
 template <class F> __device__ bool writes_pixel(int lane) { return lane % F::kLanes == 0; }
@@ -89,12 +87,10 @@ template <int C> struct Values {
   float v[C];
 
   __device__ void add(float weight, const Values& other) {
-#pragma unroll
-    for (int c = 0; c < C; ++c) v[c] = madd(weight, other.v[c], v[c]);
+    AR_UNROLL for (int c = 0; c < C; ++c) v[c] = madd(weight, other.v[c], v[c]);
   }
   __device__ Values& operator+=(const Values& other) {
-#pragma unroll
-    for (int c = 0; c < C; ++c) v[c] += other.v[c];
+    AR_UNROLL for (int c = 0; c < C; ++c) v[c] += other.v[c];
     return *this;
   }
 };
@@ -108,24 +104,18 @@ template <int S, int C, int kSets> struct PixelState {
   int last[S];
 
   __device__ void start(bool open) {
-#pragma unroll
-    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
+    AR_UNROLL for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
     clear_channels();
   }
-  __device__ void clear_channels() {
-#pragma unroll
-    for (int k = 0; k < kSets; ++k) channels[k] = {};
-  }
+  __device__ void clear_channels() { AR_UNROLL for (int k = 0; k < kSets; ++k) channels[k] = {}; }
   __device__ Values<C> total() const {
     Values<C> sum = channels[0];
-#pragma unroll
-    for (int k = 1; k < kSets; ++k) sum += channels[k];
+    AR_UNROLL for (int k = 1; k < kSets; ++k) sum += channels[k];
     return sum;
   }
   __device__ bool open() const {
     bool any = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
+    AR_UNROLL for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
     return any;
   }
 };
@@ -134,8 +124,7 @@ template <int S, int C, int kSets> struct PixelState {
 template <int S, int C, class Composite>
 __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
   float contribution = 0;
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
+  AR_UNROLL for (int s = 0; s < S; ++s) {
     const Blended<float> b = composite(s);
     if constexpr (S == 1) {
       if (b.mask) sums.add(b.if_shown, channels);
@@ -149,8 +138,7 @@ __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& ch
 }
 template <int C> __device__ Values<C> times(float scale, const Values<C>& values) {
   Values<C> scaled;
-#pragma unroll
-  for (int c = 0; c < C; ++c) scaled.v[c] = scale * values.v[c];
+  AR_UNROLL for (int c = 0; c < C; ++c) scaled.v[c] = scale * values.v[c];
   return scaled;
 }
 

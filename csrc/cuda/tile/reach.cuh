@@ -17,12 +17,10 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
   uint32_t reached = 0;
   if constexpr (F::kExpensive) {
     const Support<float> support = support_of(splat);
-#pragma unroll
-    for (int row = 0; row < kRows; ++row) {
+    AR_UNROLL for (int row = 0; row < kRows; ++row) {
       const float y = float(y0 + row * kHigh);
       const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
-#pragma unroll
-      for (int column = 0; column < kColumns; ++column) {
+      AR_UNROLL for (int column = 0; column < kColumns; ++column) {
         const float x = float(x0 + column * kWide);
         reached |= uint32_t(span.lo <= x + float(kWide - 1) && span.hi >= x) << (row * kColumns + column);
       }
@@ -34,11 +32,9 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
     const float distance = float(max(kWide * kColumns, kHigh * kRows)) + max(abs(first.x), abs(first.y));
     const BoxReach<float> box =
         make_box_reach(w, splat.level, {middle.x + float(F::kReach), middle.y + float(F::kReach)}, distance);
-#pragma unroll
-    for (int row = 0; row < kRows; ++row) {
+    AR_UNROLL for (int row = 0; row < kRows; ++row) {
       const Vec2<float> z = transform(w, Vec2<float>{first.x + middle.x, first.y + (middle.y + float(row * kHigh))});
-#pragma unroll
-      for (int column = 0; column < kColumns; ++column) {
+      AR_UNROLL for (int column = 0; column < kColumns; ++column) {
         const float right = float(column * kWide);
         const Vec2<float> center = {madd(w.xx, right, z.x), madd(w.yx, right, z.y)};
         reached |= uint32_t(reaches_box(box, center)) << (row * kColumns + column);
@@ -85,15 +81,12 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
     const Entry* list = of_warps[threadIdx.x / 32];
     int k = from;
     if constexpr (kAhead > 1) {
-#pragma unroll 1
-      for (; k + kAhead <= to; k += kAhead) {
+      AR_NO_UNROLL for (; k + kAhead <= to; k += kAhead) {
         const Entries entries = *reinterpret_cast<const Entries*>(list + k);
-#pragma unroll
-        for (int i = 0; i < kAhead; ++i) visit(entries.of[i]);
+        AR_UNROLL for (int i = 0; i < kAhead; ++i) visit(entries.of[i]);
       }
     }
-#pragma unroll 1
-    for (; k < to; ++k) visit(list[k]);
+    AR_NO_UNROLL for (; k < to; ++k) visit(list[k]);
   }
 };
 

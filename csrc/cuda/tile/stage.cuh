@@ -33,8 +33,7 @@ __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F,
       return {{v.x, v.y, v.z, v.w}};
     }
     Values<C> values;
-#pragma unroll
-    for (int c = 0; c < C; ++c) values.v[c] = first + c < channels.count ? row[c] : 0;
+    AR_UNROLL for (int c = 0; c < C; ++c) values.v[c] = first + c < channels.count ? row[c] : 0;
     return values;
   }
 }

@@ -37,8 +37,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
   bool chosen[kWidth], any = false;
   T rates[kWidth];
   int64_t row = p.rows || t.head > 0 ? i / t.row_size : 0, column = i - row * t.row_size;
-#pragma unroll
-  for (int k = 0; k < kWidth; ++k) {
+  AR_UNROLL for (int k = 0; k < kWidth; ++k) {
     chosen[k] = !p.rows || p.rows[row];
     any |= chosen[k];
     rates[k] = column < t.head ? t.rule.head_rate : t.rule.rate;
@@ -50,8 +49,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
   if (!any) return;
   const Packed<T> grad = packed(t.grad + i);
   Packed<T> param = packed(t.param + i), exp_avg = packed(t.exp_avg + i), exp_avg_sq = packed(t.exp_avg_sq + i);
-#pragma unroll
-  for (int k = 0; k < kWidth; ++k) {
+  AR_UNROLL for (int k = 0; k < kWidth; ++k) {
     if (chosen[k]) ar::adam(t.rule, rates[k], grad.values[k], param.values[k], exp_avg.values[k], exp_avg_sq.values[k]);
   }
   packed(t.param + i) = param;

@@ -11,10 +11,8 @@ namespace {
 
 constexpr int kThreads = 256, kPixels = 8;
 
-/// Calls body(pixel) for the pixels of this thread.
 template <class Body> __device__ void for_each_pixel(int64_t pixels, const Body& body) {
-#pragma unroll
-  for (int k = 0; k < kPixels; ++k) {
+  AR_UNROLL for (int k = 0; k < kPixels; ++k) {
     const int64_t i = (int64_t(blockIdx.x) * kPixels + k) * kThreads + threadIdx.x;
     if (i < pixels) body(i);
   }
@@ -37,8 +35,7 @@ __global__ void __launch_bounds__(kThreads) correct_vjp_kernel(const CorrectVjpP
   T sums[kCorrection] = {};
   for_each_pixel(p.pixels, [&](int64_t i) { correct_color_vjp(p, correction, i, sums); });
   if (!block_sums) return;
-#pragma unroll
-  for (int k = 0; k < kCorrection; ++k) {
+  AR_UNROLL for (int k = 0; k < kCorrection; ++k) {
     const T sum = warp_sum(sums[k]);
     if (lane_id() == 0) of_warps[threadIdx.x / 32][k] = sum;
   }

@@ -46,7 +46,7 @@ template <typename T> __device__ Position position_of(int block, int height, int
   return {block / across / down, block / across % down * Tile::kRows, block % across * Tile::kColumns};
 }
 
-/// Calls copy(index in Shared::read, pixel of the plane or -1 outside the image) for what the windows of a tile read.
+/// copy(index in Shared::read, pixel of the plane or -1 outside the image) for what windows read.
 template <typename T, class Copy>
 __device__ void for_each_read(Position position, int height, int width, const Copy& copy) {
   using Tile = Tile<T>;
@@ -58,7 +58,7 @@ __device__ void for_each_read(Position position, int height, int width, const Co
   }
 }
 
-/// Calls body(index in Shared::read, index in Shared::sums) for every run of sums along rows.
+/// body(index in Shared::read, index in Shared::sums) for every run of sums along rows.
 template <typename T, class Body> __device__ void for_each_run(const Body& body) {
   using Tile = Tile<T>;
   constexpr int kRuns = Tile::kColumns / Tile::kRun;
@@ -70,27 +70,24 @@ template <typename T, class Body> __device__ void for_each_run(const Body& body)
 
 /// out[j] is the window sum of the eleven values from v[j] on.
 template <typename T, int kRun> __device__ void sum_run(const T (&v)[kRun + kReach], T (&out)[kRun]) {
-#pragma unroll
-  for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
+  AR_UNROLL for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
 }
 
 template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[Tile<T>::kRun]) {
   using Tile = Tile<T>;
   const int column = threadIdx.x % Tile::kColumns, row = threadIdx.x / Tile::kColumns * Tile::kRun;
   T v[Tile::kRun + kReach];
-#pragma unroll
-  for (int k = 0; k < Tile::kRun + kReach; ++k) v[k] = along_rows[(row + k) * Tile::kSumPitch + column];
+  AR_UNROLL for (int k = 0; k < Tile::kRun + kReach; ++k) v[k] = along_rows[(row + k) * Tile::kSumPitch + column];
   sum_run<T, Tile::kRun>(v, out);
 }
 
-/// Calls body(j, pixel of the plane) for each pixel j of this thread in the image.
+/// body(j, pixel of the plane) for each pixel j of this thread in the image.
 template <typename T, class Body>
 __device__ void for_each_pixel(Position position, int height, int width, const Body& body) {
   using Tile = Tile<T>;
   const int x = position.left + threadIdx.x % Tile::kColumns;
   const int top = position.top + threadIdx.x / Tile::kColumns * Tile::kRun;
-#pragma unroll
-  for (int j = 0; j < Tile::kRun; ++j) {
+  AR_UNROLL for (int j = 0; j < Tile::kRun; ++j) {
     if (x < width && top + j < height) body(j, int64_t(top + j) * width + x);
   }
 }
@@ -117,16 +114,13 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
     T x[kValues], y[kValues], product[kValues], out[kRun];
     const auto sum = [&](const T(&values)[kValues], int moment) {
       sum_run<T, kRun>(values, out);
-#pragma unroll
-      for (int j = 0; j < kRun; ++j) shared.sums[moment][to + j] = out[j];
+      AR_UNROLL for (int j = 0; j < kRun; ++j) shared.sums[moment][to + j] = out[j];
     };
     const auto sum_products = [&](const T(&a)[kValues], const T(&b)[kValues], int moment) {
-#pragma unroll
-      for (int k = 0; k < kValues; ++k) product[k] = a[k] * b[k];
+      AR_UNROLL for (int k = 0; k < kValues; ++k) product[k] = a[k] * b[k];
       sum(product, moment);
     };
-#pragma unroll
-    for (int k = 0; k < kValues; ++k) {
+    AR_UNROLL for (int k = 0; k < kValues; ++k) {
       x[k] = shared.read[0][from + k];
       y[k] = shared.read[1][from + k];
     }
@@ -138,19 +132,16 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
   });
   __syncthreads();
   T sums[kSsimMoments][kRun];
-#pragma unroll
-  for (int m = 0; m < kSsimMoments; ++m) sum_columns<T>(shared.sums[m], sums[m]);
+  AR_UNROLL for (int m = 0; m < kSsimMoments; ++m) sum_columns<T>(shared.sums[m], sums[m]);
 
   T l1_sum = T(0), ssim_sum = T(0);
   for_each_pixel<T>(position, p.height, p.width, [&](int j, int64_t pixel) {
     T moments[kSsimMoments];
-#pragma unroll
-    for (int m = 0; m < kSsimMoments; ++m) moments[m] = sums[m][j];
+    AR_UNROLL for (int m = 0; m < kSsimMoments; ++m) moments[m] = sums[m][j];
     const Ssim<T> s = ar::ssim(moments);
     if (p.map) p.map[plane + pixel] = s.value;
     if (p.partials) {
-#pragma unroll
-      for (int k = 0; k < kSsimPartials; ++k) p.partials[k * p.pixels() + plane + pixel] = s.partials[k];
+      AR_UNROLL for (int k = 0; k < kSsimPartials; ++k) p.partials[k * p.pixels() + plane + pixel] = s.partials[k];
     }
     l1_sum += abs(image[pixel] - pixel_value<T>(target[pixel]));
     ssim_sum += s.value;
@@ -187,32 +178,26 @@ __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<
 
   for_each_read<T>(position, p.height, p.width, [&](int to, int64_t pixel) {
     const T scale = p.dL_dmap && pixel >= 0 ? p.dL_dmap[plane + pixel] : T(1);
-#pragma unroll
-    for (int k = 0; k < kSsimPartials; ++k)
-      shared.read[k][to] = pixel < 0 ? T(0) : p.partials[k * p.pixels() + plane + pixel] * scale;
+    AR_UNROLL for (int k = 0; k < kSsimPartials; ++k) shared.read[k][to] =
+        pixel < 0 ? T(0) : p.partials[k * p.pixels() + plane + pixel] * scale;
   });
   __syncthreads();
   for_each_run<T>([&](int from, int to) {
-#pragma unroll
-    for (int m = 0; m < kSsimPartials; ++m) {
+    AR_UNROLL for (int m = 0; m < kSsimPartials; ++m) {
       T values[kRun + kReach], out[kRun];
-#pragma unroll
-      for (int k = 0; k < kRun + kReach; ++k) values[k] = shared.read[m][from + k];
+      AR_UNROLL for (int k = 0; k < kRun + kReach; ++k) values[k] = shared.read[m][from + k];
       sum_run<T, kRun>(values, out);
-#pragma unroll
-      for (int j = 0; j < kRun; ++j) shared.sums[m][to + j] = out[j];
+      AR_UNROLL for (int j = 0; j < kRun; ++j) shared.sums[m][to + j] = out[j];
     }
   });
   __syncthreads();
   T sums[kSsimPartials][kRun];
-#pragma unroll
-  for (int m = 0; m < kSsimPartials; ++m) sum_columns<T>(shared.sums[m], sums[m]);
+  AR_UNROLL for (int m = 0; m < kSsimPartials; ++m) sum_columns<T>(shared.sums[m], sums[m]);
 
   const LossWeights<T> weights = pixel_weights(p);
   for_each_pixel<T>(position, p.height, p.width, [&](int j, int64_t pixel) {
     T partials[kSsimPartials];
-#pragma unroll
-    for (int k = 0; k < kSsimPartials; ++k) partials[k] = sums[k][j];
+    AR_UNROLL for (int k = 0; k < kSsimPartials; ++k) partials[k] = sums[k][j];
     p.dL_dimage[plane + pixel] =
         ar::ssim_vjp(p.image[plane + pixel], pixel_value<T>(p.target[plane + pixel]), partials, weights);
   });
