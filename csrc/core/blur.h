@@ -54,7 +54,6 @@ template <class B, typename T> struct BlurContext {
 };
 template <typename T> struct BlurContext<NoBlur, T> {};
 
-/// Gradient of the logarithm of the amplitude by Sigma.
 template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance, const BlurredCov<T>& cov) {
   const T inv = inverse_root(c.det, cov.streaked.det), x = inv * cov.adj_streak.x, y = inv * cov.adj_streak.y;
   return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);

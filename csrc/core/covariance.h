@@ -40,7 +40,7 @@ template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL
           q.w * t.z + q.x * t.y - q.y * t.x};
 }
 
-/// Sigma = V V^T, V = A R S. Of a 3D covariance Sigma = A cov3d A^T, without `quaternion` to `normal`.
+/// Sigma = V V^T, V = A R S. Of a 3D covariance A cov3d A^T, without `quaternion` to `normal`.
 template <typename T> struct Factors {
   Jacobian<T> jacobian;
   UnitQuaternion<T> quaternion;

@@ -15,7 +15,7 @@ template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
   }
 }
 
-/// In the coordinates of the columns t_k of A R, Sigma = A R S^2 R^T A^T: H_kl = t_k . dL/dSigma t_l.
+/// In the columns t_k of A R, Sigma = A R S^2 R^T A^T: H_kl = t_k . dL/dSigma t_l.
 template <typename T> struct TurnedGrad {
   Vec3<T> diagonal, off;       ///< H_kk; H_12, H_20, H_01
   Vec3<T> x, y;                ///< rows of dL/dSigma t_k

@@ -11,8 +11,7 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
 /// By sums of earlier ones. Returns the sum of all.
 int64_t sum_before(int64_t* numbers, int64_t n, int threads);
 
-/// Replaces counts [parts, kinds] of items by the index of the first item, and sets firsts[kind]. Returns the number of
-/// items.
+/// Replaces counts [parts, kinds] by the index of the first item, and sets firsts[kind]. Returns the number of items.
 int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, int64_t* firsts);
 
 }  // namespace ar::cpu

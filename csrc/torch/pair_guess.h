@@ -144,7 +144,7 @@ class PairGuesses {
     if (int32_t(frame.number - s.first_frame) >= 0) s.guess.counted(gaussians, frame.tiles, pairs);
   }
 
-  /// For tests: room for so many pairs, and one of each Gaussian; 0: guesses, anew.
+  /// For tests: room for so many pairs; 0: guesses, anew.
   void force(int64_t capacity) {
     forced_ = capacity;
     for (Slot& s : slots_) s = Slot{};

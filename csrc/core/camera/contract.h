@@ -53,7 +53,7 @@ template <typename T> AR_HD void add_row_vjp(Vec4<T>& to, T dL_dvalue, Vec3<T> p
 }
 template <typename T> AR_HD void add_xyz(Vec4<T>& to, Vec3<T> v) { to = {to.x + v.x, to.y + v.y, to.z + v.z, to.w}; }
 
-/// The plain camera, a pinhole, by value: rows of matrices, loaded once per thread.
+/// The plain camera, a pinhole: rows of matrices, loaded once per thread.
 template <typename Scalar> struct Camera {
   static constexpr bool kFull = false;
   static constexpr int kShDegree = 3;   ///< the largest; coefficients take registers
@@ -93,7 +93,7 @@ template <typename T> struct ProjectedMean {
   bool valid;  ///< map() is true, and numbers are finite
 };
 
-/// Rows of A = J W, world units to px: J in camera space, W the upper left 3x3 of the view.
+/// Rows of A = J W: J in camera space, W the upper left 3x3 of the view.
 template <typename T> struct Jacobian {
   Vec3<T> x, y;
   T ratio_x, ratio_y;         ///< of Pinhole: clamped x/z and y/z

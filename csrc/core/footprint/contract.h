@@ -198,9 +198,9 @@ enum class GradFrame {
   kPixels,      ///< the identity: dL_dwhite is dL/dSigma
 };
 
-/// Gradient of one splat: dL = dL_dmean . dmean + tr(dL_dwhite w dSigma w^T) + dL_dlog_amp d(log amp), with amp =
-/// sqrt(det Sigma / det(Sigma + variance I)). It stays in factors until covariance_vjp.h, since products would cancel
-/// (docs/internals/numerics.md, "Gradients").
+/// dL = dL_dmean . dmean + tr(dL_dwhite w dSigma w^T) + dL_dlog_amp d(log amp), with amp = sqrt(det Sigma / det(Sigma +
+/// variance I)). In factors until covariance_vjp.h, since products would cancel (docs/internals/numerics.md,
+/// "Gradients").
 template <typename T> struct SplatGrad {
   Vec2<T> dL_dmean;
   Mat2<T> w;
@@ -216,7 +216,7 @@ template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
           scale * quotient(c.xx * (c.xx + v) + square, c.det)};
 }
 
-/// dL/dSigma as one matrix, for a Sigma without factors.
+/// For a Sigma without factors.
 template <typename T> AR_HD Sym2<T> cov_grad(Cov2d<T> c, const SplatGrad<T>& grad) {
   const Sym2<T> g = congruence_transposed(grad.w, grad.dL_dwhite);
   if (grad.dL_dlog_amp == T(0)) return g;  // det Sigma may be zero

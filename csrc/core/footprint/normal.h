@@ -88,7 +88,7 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
   return {transform_transposed(w, sums.offset), w, half, T(0), T(0), frame};
 }
 
-/// Along one axis, how much the pixel may raise the level of the Gaussian with variance 1/t = sigma^2 + 1/12
+/// How much the pixel may raise the level along an axis of the Gaussian with variance 1/t = sigma^2 + 1/12
 /// (docs/internals/numerics.md, "Support").
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 

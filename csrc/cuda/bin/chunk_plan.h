@@ -86,8 +86,8 @@ struct CutList {
 static_assert(sizeof(CutList) == sizeof(TileChunk), "they are rows of one array");
 
 /// Checkpoints of still/: planes of kTile^2 floats, a number of every lane. With `keep` (a backward pass) a chunk has
-/// channels and transmittance of every sample. Else it has the transmittance of every sample and one set of channels,
-/// and only the last front chunk and the tail have planes.
+/// channels and transmittance of every sample. Else it has one set of channels, and only the last front chunk and the
+/// tail have planes.
 struct CheckpointLayout {
   int channels;
   bool keep;
@@ -100,7 +100,7 @@ struct CheckpointLayout {
     const int used = chunks > front ? chunks - first_chunk(front) : keep ? chunks - 1 : 0;
     return (used > 0 ? used : 0) * planes(samples);
   }
-  /// Room for up to `pairs` pairs. Rounding adds a chunk to tiles with a tail: at most blocks_at_once.
+  /// For up to `pairs` pairs. Rounding adds a chunk to tiles with a tail: at most blocks_at_once.
   int64_t max_planes(TileGrid grid, int samples, int64_t pairs, int blocks_at_once) const {
     const int64_t full = (pairs / kChunkLength + 2) * planes(samples);
     const int64_t with_tail = grid.tiles() < blocks_at_once ? grid.tiles() : blocks_at_once;

@@ -1,5 +1,5 @@
 // What the blocks of projection keep in shared memory, forward and backward: the camera, and a row of coefficients of
-// harmonics for each Gaussian of a warp. And how these kernels are launched.
+// harmonics for each Gaussian. And how these kernels are launched.
 #pragma once
 
 #include <algorithm>
@@ -31,8 +31,7 @@ template <int kDegree> struct ShRows {
   static constexpr int kCount = sh_count(kDegree), kStride = ((3 * kCount + 3) / 4 | 1) * 4;
   alignas(16) float value[32][kStride];
 
-  /// Begins to load `count` coefficients for each of `lanes`, to read after wait_for_copies(). `base`: [32, stride] of
-  /// the warp.
+  /// `count` coefficients for each of `lanes`, to read after wait_for_copies(). `base`: [32, stride] of the warp.
   __device__ void begin_load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
     if (stride == kPacked && count == kPacked && in_quads(base)) return begin_load_packed(base, lanes);
     const float* from = &base->x + lane_id();

@@ -20,7 +20,7 @@ inline constexpr int kBlendThreads = 32 * kSubtiles;
 template <class F> inline constexpr int kSubtileWide = 8 >> (kTileBits - spread_tile_bits(F::kLanes, true));
 template <class F> inline constexpr int kSubtileHigh = kSubtileWide<F> / 2;
 
-/// Stands for the footprint in kernels that do not evaluate it.
+/// For kernels that do not evaluate the footprint.
 template <int S, int kLanesOfPixel> struct LaneSamples {
   static constexpr int kSamples = S, kLanes = kLanesOfPixel;
 };

@@ -1,6 +1,6 @@
 // The table of dispatch.h, written out a second time: which family of kernels blends each footprint of the registry, in
-// tiles of which size, with how many samples in a lane. tests/project/test_build.py compares the names of its kernels with the
-// sources.
+// tiles of which size, with how many samples in a lane. tests/project/test_build.py compares the names of its kernels
+// with the sources.
 #include "cuda_on_host.h"
 // After it: what kernels include.
 #include <gtest/gtest.h>
