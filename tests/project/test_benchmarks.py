@@ -481,7 +481,7 @@ def test_gsplat_training(tmp_path, monkeypatch, capsys):
     found = {}
     for steps, options in ((1, []), (60, []), (20, ["--packed", "--absgrad", "--antialiased"])):
         options = [*options, "--iterations", str(steps), "--refine-start", "5", "--refine-every", "10"]
-        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *files_of(small_scene), *options])
+        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, *options])
         assert program.main() == 0
         [header, row] = capsys.readouterr().out.splitlines()[1:]
         assert header.split()[:4] == ["rasterizer", "seconds", "PSNR", "Gaussians"] and row.split()[0] == "ours"
