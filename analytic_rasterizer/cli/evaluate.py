@@ -101,10 +101,10 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
         io.SceneError: options.json is not what `train` writes.
         ValueError: Nothing names the capture.
     """
-    if found.options is not None:
+    if found.training is not None:
         try:
-            source = CaptureSource.from_dict(found.options["source"])
-            options = TrainingOptions.from_dict(found.options["options"])
+            source = CaptureSource.from_dict(found.training.source)
+            options = TrainingOptions.from_dict(found.training.options)
             scales = options.scales
         except (ValueError, KeyError, TypeError) as error:
             raise io.SceneError(f"{found.path.parent / OPTIONS}: not what `train` writes ({error})") from None
@@ -207,7 +207,7 @@ def default_out(given: str, found: io.FoundScene) -> Path:
     """Where results go: to the folder that was given or trained in, or else beside the file."""
     if Path(given).is_dir():
         return Path(given)
-    own = found.path.name == SCENE and found.options is not None
+    own = found.path.name == SCENE and found.training is not None
     return found.path.parent if own else found.path.with_name(f"{found.path.stem}_evaluation")
 
 

@@ -20,11 +20,11 @@ def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Ca
     Views with a lens have none, since the page draws them without it. A photograph is read when its function is
     called, which returns a PNG of what the training saw: reduced, cut and on the background as there.
     """
-    if found.options is None or not views:
+    if found.training is None or not views:
         return {}, []
     try:
-        source = CaptureSource.from_dict(found.options["source"])
-        options = TrainingOptions.from_dict(found.options["options"])
+        source = CaptureSource.from_dict(found.training.source)
+        options = TrainingOptions.from_dict(found.training.options)
         capture = source.load_photographs()  # in world coordinates: views are known by their names
     except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
         return {}, [f"no photographs: {error}"]

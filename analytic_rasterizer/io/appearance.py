@@ -6,10 +6,7 @@ cameras.json; from the program of 3DGS, whose model folder holds cfg_args and ca
 
 from __future__ import annotations
 
-import json
-import math
 import shlex
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,13 +23,13 @@ from ..footprints import (
     resolve_footprint,
 )
 from . import ply
-from .common import BACKGROUNDS, BLACK, WHITE, SceneError
+from .common import BLACK, WHITE, SceneError
 from .metadata import SceneMetadata, read_metadata
 from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
 from .scenes import FILTER_3D
+from .trained import CAMERAS, OPTIONS, SCENE, TrainingRecord, read_record
 from .views import load_views
 
-SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"  # of the folder of a training
 UNMARKED = resolve_footprint(DILATED)  # what a file wants that says nothing: 3DGS trains with it
 ANTIALIASED = resolve_footprint(COMPENSATED)  # and one that says only that pixels are to be integrated
 
@@ -57,7 +54,7 @@ class FoundScene:
     Attributes:
         path: The file of the Gaussians.
         metadata: What this file says.
-        options: options.json of a training of this package, beside it; None where there is none.
+        training: What a training of this package says beside it; None where there is none.
         cfg_args: What cfg_args of 3DGS says, beside it or in the folder of the model; None where there is none.
         model: That folder.
         cameras: cameras.json, beside it or in the folder of the model; None where there is none.
@@ -66,11 +63,16 @@ class FoundScene:
 
     path: Path
     metadata: SceneMetadata
-    options: dict[str, Any] | None = None
+    training: TrainingRecord | None = None
     cfg_args: CfgArgs | None = None
     model: Path | None = None
     cameras: Path | None = None
     has_filter_3d: bool = False
+
+    @property
+    def options(self) -> dict[str, Any] | None:
+        """All that options.json of that training holds."""
+        return None if self.training is None else self.training.content
 
     @property
     def is_trained_here(self) -> bool:
@@ -78,13 +80,13 @@ class FoundScene:
 
         Another scene may have been copied over it, whose training had nothing to do with these options.
         """
-        if self.options is None or self.path.name != SCENE:
+        if self.training is None or self.path.name != SCENE:
             return False
-        trained = resolve_footprint(self.options["options"]["footprint"])
+        trained = self.training.footprint
         if self.metadata.footprint is not None:
             return resolve_footprint(self.metadata.footprint) == trained
         # Trainings before files named their footprint; these marked whether pixels are integrated.
-        return "background" not in self.options and bool(self.metadata.antialiased) == (trained.name != UNMARKED.name)
+        return self.training.is_early and bool(self.metadata.antialiased) == (trained.name != UNMARKED.name)
 
     @property
     def trained_with(self) -> Choice | None:
@@ -92,8 +94,7 @@ class FoundScene:
         if self.metadata.footprint is not None:
             return Choice(resolve_footprint(self.metadata.footprint), f"{self.path.name} says so")
         if self.is_trained_here:
-            trained = self.options["options"]["footprint"]
-            return Choice(resolve_footprint(trained), f"{OPTIONS} beside {self.path.name} says so")
+            return Choice(self.training.footprint, f"{OPTIONS} beside {self.path.name} says so")
         if self.cfg_args is not None and self.cfg_args.kernel_size is not None:
             size = self.cfg_args.kernel_size
             reason = f"{CFG_ARGS} says kernel_size {size:g}, the variance of Mip-Splatting's filter"
@@ -120,33 +121,25 @@ class FoundScene:
         """The colour behind the scene, in its training, and who says so; None where nothing does."""
         if self.metadata.background is not None:
             return self.metadata.background, self.path.name
-        if self.options is not None:
-            color = self.options.get("background")
-            if color is None:  # of a training before options.json said it
-                color = BACKGROUNDS.get(self.options["options"].get("background"))
-            if color is not None:
-                return tuple(map(float, color)), OPTIONS
+        if self.training is not None and self.training.background is not None:
+            return self.training.background, OPTIONS
         if self.cfg_args is not None and self.cfg_args.white_background is not None:
             return (WHITE if self.cfg_args.white_background else BLACK), CFG_ARGS
         return None
 
     def trained_view(self, view: View) -> View:
         """A view of `cameras` with pixels as large as in the training's finest pictures."""
-        if self.options is not None:
-            return view.scaled(1 / self._finest)
+        if self.training is not None:
+            return view.scaled(1 / self.training.finest)
         return view if self.cfg_args is None else self.cfg_args.trained_view(view)
 
     @property
     def size_reason(self) -> str:
         """What says that the training's pictures were smaller than `cameras` states; "" where nothing does."""
-        if self.options is not None:
-            return f"{OPTIONS}: scales from {self._finest}" if self._finest > 1 else ""
+        if self.training is not None:
+            return f"{OPTIONS}: scales from {self.training.finest}" if self.training.finest > 1 else ""
         said = "" if self.cfg_args is None else self.cfg_args.size_in_words
         return said and f"{CFG_ARGS}: {said}"
-
-    @property
-    def _finest(self) -> int:
-        return min(self.options["options"]["scales"])
 
     def load_views(self, path=None, size: tuple[int, int] | None = None, trained_size: bool = True) -> list[View]:
         """The views of a file, by default of `cameras`, in the frame of the scene. Those of `cameras` have the size of
@@ -232,7 +225,7 @@ def find_scene(path) -> FoundScene:
     return FoundScene(
         path,
         metadata,
-        options=_read_options(path.parent / OPTIONS),
+        training=read_record(path.parent / OPTIONS),
         cfg_args=None if cfg_args is None else read_cfg_args(cfg_args),
         model=root,
         cameras=cameras,
@@ -264,21 +257,3 @@ def _file_in(folder: Path) -> Path:
         f"{folder}: a folder without a scene: expected {SCENE} with {OPTIONS}, which `train` writes, or "
         "point_cloud/iteration_N/point_cloud.ply of 3DGS"
     )
-
-
-def _read_options(path: Path) -> dict[str, Any] | None:
-    """What a training wrote of itself; None where there is nothing, or the options.json of another program."""
-    if not path.is_file():
-        return None
-    try:
-        described = json.loads(path.read_text(encoding="utf-8-sig"))
-        options = described["options"]
-        resolve_footprint(options["footprint"])
-        scales, color = options["scales"], described.get("background", BLACK)
-        good = bool(scales) and all(type(scale) is int and scale >= 1 for scale in scales)
-        if not good or len(color) != 3 or not all(0 <= value <= 1 and math.isfinite(value) for value in color):
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        warnings.warn(f"{path}: ignored, it is not what `train` writes", stacklevel=3)
-        return None
-    return described

@@ -11,7 +11,7 @@ import torch
 
 from .. import io
 from ..gaussians import Gaussians
-from ..io.appearance import CAMERAS, OPTIONS, SCENE  # noqa: F401  (the names by which commands find them)
+from ..io.trained import CAMERAS, OPTIONS, SCENE  # noqa: F401  (the names by which commands find them)
 from ..io.views import write_cameras  # noqa: F401
 from ..io.writing import as_json, write_json, write_safely, write_text  # noqa: F401
 
