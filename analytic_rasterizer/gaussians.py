@@ -188,7 +188,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
     Raises:
         ImportError: SciPy is missing.
     """
-    from .io.common import optional_import  # which imports this module with its package
+    from .io.errors import optional_import  # which imports this module with its package
 
     positions = points.detach().double().cpu().numpy()
     tree = optional_import("scipy.spatial", "train").cKDTree(positions)

@@ -27,6 +27,7 @@ from torch import Tensor
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, training
 from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.io.images import BACKGROUNDS
 
 FINER = 4  # pixels of a face, and rays, along a pixel of the photographs
 MARGIN = 1.02  # of a face's half width, for interpolation at its border
@@ -170,7 +171,7 @@ def main() -> None:
     add("--points", type=int, default=20000, help="of the scene's Gaussians, to start from (default: %(default)s)")
     add("--iterations", type=int, default=7000)
     add("--footprint", default="moment:samples=4")
-    add("--background", choices=io.common.BACKGROUNDS, default="black")
+    add("--background", choices=BACKGROUNDS, default="black")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     args = parser.parse_args()
@@ -179,7 +180,7 @@ def main() -> None:
     if args.wide:
         focal = [view.width / 2 / np.tan(np.radians(args.wide / 2)) for view in views]
         views = [replace(view, fx=f, fy=f) for view, f in zip(views, focal)]
-    renderer = Renderer(scene, args.device, "box:samples=4", io.common.BACKGROUNDS[args.background])
+    renderer = Renderer(scene, args.device, "box:samples=4", BACKGROUNDS[args.background])
     drawn = torch.randperm(scene.count, generator=torch.Generator().manual_seed(0))[: args.points]
     points, colors = scene.means[drawn], (0.5 + 0.2820948 * scene.shs[drawn, 0]).clamp(0, 1)
     lenses = {

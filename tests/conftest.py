@@ -93,11 +93,11 @@ def synthetic(tmp_path_factory):
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """The folder of a capture in the files of COLMAP, whose sizes do not halve evenly."""
-    from capture_files import circle, g, write_colmap, write_pictures
+    from capture_files import circle, random_points, write_colmap, write_pictures
 
     folder = tmp_path_factory.mktemp("capture")
     views = circle(9, (35, 33))
-    points, colors = g.random_points(60, seed=5)
+    points, colors = random_points(60, seed=5)
     write_pictures(folder / "photographs", views, opaque=True)
     write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
     return folder

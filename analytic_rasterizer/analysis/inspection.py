@@ -17,7 +17,7 @@ DRAWN = 8  # views in the histogram
 
 
 @dataclass(frozen=True)
-class Finding:
+class EffectFinding:
     """What was found about one effect."""
 
     name: str
@@ -77,7 +77,7 @@ class SceneReport:
     machine: str
     effects: Effects
     footprint: str
-    findings: tuple[Finding, ...]
+    findings: tuple[EffectFinding, ...]
     candidates: tuple[Candidate, ...]
     views: tuple[ViewReport, ...]
     shown: torch.Tensor

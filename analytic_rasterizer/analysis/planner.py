@@ -28,7 +28,7 @@ from ..render.stages import Splats, Stages, project, render_stages
 from ..sh import needed_sh_degree, sh_band_bounds
 from . import timing
 from .affine import LIMIT, affine_error
-from .inspection import BINS, NARROW, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
+from .inspection import BINS, NARROW, Candidate, EffectFinding, SceneReport, ViewReport, in_255, percent, share
 
 LADDER = sampled_footprints()  # what is tried
 BASE, REFERENCE = LADDER[0], LADDER[-1]  # the cheapest, and what the others are compared with
@@ -53,7 +53,7 @@ def plan(
     Arguments and errors are those of `inspect_scene`.
     """
     cameras, training = _check(scene, views, tolerance, training_views)
-    return _survey(scene, cameras, tolerance, training).effects
+    return _choose_effects(scene, cameras, tolerance, training).effects
 
 
 @torch.no_grad()
@@ -90,27 +90,27 @@ def inspect_scene(
     cameras, training = _check(scene, views, tolerance, training_views, scale, background)
     if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
         raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
-    survey = _survey(scene, cameras, tolerance, training)
+    chosen = _choose_effects(scene, cameras, tolerance, training)
     rms = {footprint: [] for footprint in LADDER}
     fitting, seen = list(rms), []  # footprints within the tolerance so far; what each view shows
     shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     top_band = 0.0  # what the last band of the harmonics changes
     for camera in cameras:
-        reference = _stages(scene, camera, REFERENCE, survey.everything)
+        reference = _stages(scene, camera, REFERENCE, chosen.everything)
         seen.append(_touching(reference))
         shown, on_image = shown | seen[-1], on_image | (reference.radii > 0)
         for footprint in list(fitting):
-            stages = _stages(scene, camera, footprint, survey.effects)
+            stages = _stages(scene, camera, footprint, chosen.effects)
             rms[footprint].append(_rms(stages, reference))
             shown = shown | _touching(stages)
             if rms[footprint][-1] > tolerance:
                 fitting.remove(footprint)
-        if survey.effects.sh_degree is None and scene.sh_degree > 0:
-            fewer = replace(survey.everything, sh_degree=scene.sh_degree - 1)
+        if chosen.effects.sh_degree is None and scene.sh_degree > 0:
+            fewer = replace(chosen.everything, sh_degree=scene.sh_degree - 1)
             top_band = max(top_band, _rms(_stages(scene, camera, REFERENCE, fewer), reference))
 
     timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
-    tried = {name: (scene, name, survey.effects) for name in dict.fromkeys([BASE, *fitting])}
+    tried = {name: (scene, name, chosen.effects) for name in dict.fromkeys([BASE, *fitting])}
     seconds = _seconds(tried, timed, rounds)
     cheapest = min(seconds[name] for name in fitting)
     footprint = next(name for name in fitting if seconds[name] <= SAME * cheapest)
@@ -119,18 +119,18 @@ def inspect_scene(
     reports = []
     for i, camera in enumerate(cameras):
         name = getattr(views[i], "name", f"view_{i:03d}")
-        reports.append(_view_report(scene, survey, i, name, camera, seen[i], rms[footprint][i]))
-    costs = _effect_costs(scene, timed, footprint, survey.effects, shown, rounds)
+        reports.append(_view_report(scene, chosen, i, name, camera, seen[i], rms[footprint][i]))
+    costs = _effect_costs(scene, timed, footprint, chosen.effects, shown, rounds)
     findings = (
         _footprint_finding(candidates, footprint, reports),
-        _sh_finding(scene, survey, top_band, costs.get("sh")),
-        _filter_finding(survey, costs.get("filter_3d")),
+        _sh_finding(scene, chosen, top_band, costs.get("sh")),
+        _filter_finding(chosen, costs.get("filter_3d")),
         _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
         _affine_finding(scene, cameras, seen, [report.name for report in reports]),
-        *_other_findings(survey, costs["outputs"]),
+        *_other_findings(chosen, costs["outputs"]),
     )
     machine = timing.describe_machine(scene.means.device.type)
-    found = (survey.effects, footprint, findings, tuple(candidates.values()), tuple(reports), shown)
+    found = (chosen.effects, footprint, findings, tuple(candidates.values()), tuple(reports), shown)
     return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *found)
 
 
@@ -159,7 +159,7 @@ def _cameras(what: str, views, device, *options) -> list[GaussianRasterizationSe
 
 
 @dataclass(frozen=True, eq=False)
-class _Survey:
+class _ChosenEffects:
     """The choice of effects, and what it is based on."""
 
     effects: Effects  # recommended
@@ -170,7 +170,7 @@ class _Survey:
     off_center: list[bool]  # which views are
 
 
-def _survey(scene: Gaussians, cameras: list, tolerance: float, training: list | None) -> _Survey:
+def _choose_effects(scene: Gaussians, cameras: list, tolerance: float, training: list | None) -> _ChosenEffects:
     orthographic = [is_orthographic(camera) for camera in cameras]
     if any(orthographic) != all(orthographic):
         raise ValueError(
@@ -197,7 +197,7 @@ def _survey(scene: Gaussians, cameras: list, tolerance: float, training: list | 
         sh_degree=degree if degree < scene.sh_degree else None,
         filter_3d=everything.filter_3d if (filter_change or 0) > FILTER_SHARE * tolerance else None,
     )
-    return _Survey(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
+    return _ChosenEffects(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
 
 
 def _prepare(scene: Gaussians, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:
@@ -258,43 +258,43 @@ def _effect_costs(scene: Gaussians, cameras, footprint, effects: Effects, shown,
     return {name: seconds[on] / seconds[off] for name, (on, off) in with_and_without.items()}
 
 
-def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: list[ViewReport]) -> Finding:
+def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: list[ViewReport]) -> EffectFinding:
     narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
     best = candidates[footprint]
     reason = (
         f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; every view is within "
         f"{in_255(best.rms)}/255 of everything on"
     )
-    return Finding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
+    return EffectFinding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
 
-def _sh_finding(scene: Gaussians, survey: _Survey, top_band: float, cost: float | None) -> Finding:
-    name, degree = "spherical harmonics", survey.effects.sh_degree
+def _sh_finding(scene: Gaussians, chosen: _ChosenEffects, top_band: float, cost: float | None) -> EffectFinding:
+    name, degree = "spherical harmonics", chosen.effects.sh_degree
     if scene.sh_degree == 0:
-        return Finding(name, False, 0.0, "bound", None, "degree 0", "the scene has none beyond degree 0")
-    bounds = ", ".join(in_255(bound) for bound in survey.bounds[1:])
+        return EffectFinding(name, False, 0.0, "bound", None, "degree 0", "the scene has none beyond degree 0")
+    bounds = ", ".join(in_255(bound) for bound in chosen.bounds[1:])
     reason = f"bands 1 to {scene.sh_degree} add at most {bounds} /255 to a colour"
     if degree is None:
         reason += "; the last exceeds half the tolerance, and the change is what the views lose without it"
-        return Finding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
+        return EffectFinding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
     reason += f"; left out: those above {degree}"
-    return Finding(name, degree > 0, sum(survey.bounds[degree + 1 :]), "bound", cost, f"degree {degree}", reason)
+    return EffectFinding(name, degree > 0, sum(chosen.bounds[degree + 1 :]), "bound", cost, f"degree {degree}", reason)
 
 
-def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
-    if not survey.ratios:
-        return Finding("3D filter", None, None, None, None, "none", "not examined: no training views were given")
-    needed, change = survey.effects.filter_3d is not None, survey.filter_change
+def _filter_finding(chosen: _ChosenEffects, cost: float | None) -> EffectFinding:
+    if not chosen.ratios:
+        return EffectFinding("3D filter", None, None, None, None, "none", "not examined: no training views were given")
+    needed, change = chosen.effects.filter_3d is not None, chosen.filter_change
     reason = (
-        f"in the view with most of them, {percent(max(share(ratio > FINER) for ratio in survey.ratios))} of the "
+        f"in the view with most of them, {percent(max(share(ratio > FINER) for ratio in chosen.ratios))} of the "
         f"Gaussians are sampled more than {FINER:g} times as finely as in any training view"
     )
     reason += "; it changes less than a quarter of the tolerance" * (change is not None and not needed)
     kind = None if change is None else "measured"
-    return Finding("3D filter", needed, change, kind, cost, "filter_3d" if needed else "none", reason)
+    return EffectFinding("3D filter", needed, change, kind, cost, "filter_3d" if needed else "none", reason)
 
 
-def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float) -> Finding:
+def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float) -> EffectFinding:
     behind = reduce(torch.logical_and, (depths(scene.means, camera.viewmatrix) <= NEAR for camera in cameras))
     hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
     count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
@@ -303,10 +303,10 @@ def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float)
         f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; the cost is that of "
         "rendering them too, and `shown` of the report is the mask of the others"
     )
-    return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
+    return EffectFinding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
-def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], names: list[str]) -> Finding:
+def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], names: list[str]) -> EffectFinding:
     """Whether splats are the pictures of their Gaussians: the view in which most of them are not."""
     shares = [share(affine_error(scene, camera)[of.cpu()] > LIMIT) for camera, of in zip(cameras, seen)]
     largest = max(shares)
@@ -317,15 +317,15 @@ def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], n
         f"above {LIMIT}, docs/accuracy.md), which a splat cannot show"
     )
     advice = "pictures of narrower views" if needed else "as it is"
-    return Finding("affine picture", needed, None, None, None, advice, reason)
+    return EffectFinding("affine picture", needed, None, None, None, advice, reason)
 
 
-def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, ...]:
+def _other_findings(chosen: _ChosenEffects, cost_of_outputs: float) -> tuple[EffectFinding, ...]:
     """Orthographic views, views whose axis is off centre, and outputs."""
-    flat, off = survey.effects.orthographic, sum(survey.off_center)
+    flat, off = chosen.effects.orthographic, sum(chosen.off_center)
     w = f"w of clip space {'is the same for every position' if flat else 'depends on the position'}"
     edge = (
-        f"in {off} of {len(survey.off_center)} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures "
+        f"in {off} of {len(chosen.off_center)} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures "
         "away from the optical axis"
     )
     outputs = (
@@ -333,9 +333,9 @@ def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, .
         "cost is that of alpha and depth together"
     )
     return (
-        Finding("orthographic", flat, None, None, None, "on" if flat else "off", w),
-        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", edge),
-        Finding("outputs", False, None, None, cost_of_outputs, "off", outputs),
+        EffectFinding("orthographic", flat, None, None, None, "on" if flat else "off", w),
+        EffectFinding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", edge),
+        EffectFinding("outputs", False, None, None, cost_of_outputs, "off", outputs),
     )
 
 
@@ -346,12 +346,12 @@ def _smaller_sigmas(splats: Splats) -> torch.Tensor:
     return torch.where(largest > 0, (splats.dets / largest).sqrt(), 0)
 
 
-def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float) -> ViewReport:
-    settings, gaussians = _prepare(scene, camera, BASE, survey.effects)
+def _view_report(scene, chosen: _ChosenEffects, i: int, name: str, camera, shown, rms: float) -> ViewReport:
+    settings, gaussians = _prepare(scene, camera, BASE, chosen.effects)
     names = ("means3D", "opacities", "scales", "rotations")
     sigmas = _smaller_sigmas(project(settings, **{name: gaussians[name][shown] for name in names}))
     bins = torch.bucketize(sigmas, sigmas.new_tensor(BINS[1:-1]))
-    ratio = survey.ratios[i] if survey.ratios else None
+    ratio = chosen.ratios[i] if chosen.ratios else None
     return ViewReport(
         name=name,
         width=camera.image_width,

@@ -18,7 +18,7 @@ import torch
 
 from .. import _C
 from ..filters import PIXEL_VARIANCE
-from ..io.common import BACKGROUNDS
+from ..io.images import BACKGROUNDS
 from ..training.files import results_folder
 from .launch import report
 

@@ -6,7 +6,8 @@ install analytic_rasterizer[cli]`; they are imported on first use.
 """
 
 from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene, is_dilated
-from .common import SceneError, optional_import, to_image
+from .errors import SceneError, optional_import
+from .images import to_image
 from .metadata import SceneMetadata, read_metadata
 from .points import is_scene, load_points
 from .scenes import PLY_COLUMNS, load_scene, save_scene, written_format

@@ -23,7 +23,8 @@ from ..footprints import (
     resolve_footprint,
 )
 from . import ply
-from .common import BLACK, WHITE, SceneError
+from .errors import SceneError
+from .images import BLACK, WHITE
 from .metadata import SceneMetadata, read_metadata
 from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
 from .scenes import FILTER_3D

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from . import ply
-from .common import SceneError, naming, unreadable
+from .errors import SceneError, naming, unreadable
 from .with_gsply import data_of, fields_of, gsply
 
 PER_CHUNK = 256

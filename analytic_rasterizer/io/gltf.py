@@ -21,7 +21,7 @@ import torch
 
 from ..cameras.rotations import rotation_matrices
 from ..gaussians import SH_C0
-from .common import SceneError, naming, unreadable
+from .errors import SceneError, naming, unreadable
 from .turning import quaternion_of, turned_harmonics, turned_quaternions
 
 NAME = "KHR_gaussian_splatting"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..cameras.lens import Lens
-from .common import SceneError
+from .errors import SceneError
 
 SIMPLE_PINHOLE, PINHOLE, FULL_OPENCV = "SIMPLE_PINHOLE", "PINHOLE", "FULL_OPENCV"
 REFUSED = ("SIMPLE_DIVISION", "DIVISION", "EUCM")  # COLMAP's other models

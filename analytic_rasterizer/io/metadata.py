@@ -14,7 +14,8 @@ from typing import Any
 
 from ..footprints import COMPENSATED, DILATED, resolve_footprint
 from . import gltf, ply, sog, spz
-from .common import first_line, scene_file
+from .errors import first_line
+from .formats import scene_file
 
 OWN = "analytic_rasterizer"  # the first word of lines that only this package reads
 ANTIALIASED = "SplatRenderMode: mip"  # the line that other programs read

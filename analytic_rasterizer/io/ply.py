@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .common import SceneError, naming
+from .errors import SceneError, naming
 
 # NumPy's codes of the types, which have two names each.
 TYPES = {

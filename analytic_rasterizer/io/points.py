@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from . import ply
-from .common import FORMATS, SceneError, naming
 from .compressed import is_compressed
+from .errors import SceneError, naming
+from .formats import FORMATS
 
 AXES, COLORS = ("x", "y", "z"), ("red", "green", "blue")
 

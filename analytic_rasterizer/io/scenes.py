@@ -11,8 +11,9 @@ import torch
 
 from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
 from . import gltf, ply, sog, splat, spz
-from .common import SceneError, first_line, naming, scene_file
 from .compressed import is_compressed, read_compressed, to_compressed
+from .errors import SceneError, first_line, naming
+from .formats import scene_file
 from .metadata import SceneMetadata
 from .points import AXES, has_colors, read_colors
 from .writing import write_safely

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .common import SceneError, naming, optional_import, unreadable
+from .errors import SceneError, naming, optional_import, unreadable
 
 FIRST_MODE = 252  # of a quaternion's fourth byte, which names the largest component
 PER_ROW = 64  # entries of the palette in a row of its picture

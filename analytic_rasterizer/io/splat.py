@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..gaussians import SH_C0
-from .common import SceneError
+from .errors import SceneError
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotations", "u1", 4)])
 OTHERS = {b"ply\n": ".ply", b"ply\r": ".ply", b"\x1f\x8b\x08": ".spz", b"NGSP": ".spz", b"PK\x03\x04": ".sog"}

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .common import SceneError, naming, optional_import, unreadable
+from .errors import SceneError, naming, optional_import, unreadable
 from .with_gsply import data_of, fields_of, gsply
 
 MAGIC = b"NGSP"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..footprints import Footprint, resolve_footprint
-from .common import BACKGROUNDS, BLACK
+from .images import BACKGROUNDS, BLACK
 
 SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"
 

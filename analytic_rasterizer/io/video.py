@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from .common import optional_import
+from .errors import optional_import
 from .writing import write_safely
 
 QUALITY = 18  # constant rate factor of H.264: hardly a difference can be seen

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 
 from ..cameras.camera import View
-from .common import SceneError, first_line, opened_picture
+from .errors import SceneError, first_line
+from .images import opened_picture
 from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, sphere_of
 from .pictures import PictureFiles
 from .writing import write_json, write_text

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .common import optional_import
+from .errors import optional_import
 
 
 def gsply() -> Any:

@@ -14,9 +14,9 @@ from ..io import load_points
 from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
 from .extent import extent_of
-from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
+from .placement import random_points
 from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
 from .source import CaptureSource

@@ -18,8 +18,8 @@ from ..gaussians import Gaussians
 from ..losses import counted, ssim
 from ..render.settings import GaussianRasterizationSettings
 from .exposure import best_exposure, corrected
-from .model import render, render_together
 from .pictures import Pictures
+from .rendering import render, render_together
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors

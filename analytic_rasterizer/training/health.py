@@ -12,9 +12,9 @@ from ..density import FixedDensity
 from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
 from ..io.scenes import numbers_of
-from .model import render
 from .options import TrainingOptions, flag
 from .pictures import Pictures
+from .rendering import render
 from .schedule import Progress
 
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity

@@ -12,7 +12,7 @@ from ..checks import check_value
 from ..declared import NOT_NEGATIVE, POSITIVE, SHARE, Options, Range, at_least, described, one_of, option
 from ..density import GradientOptions
 from ..footprints import RECOMMENDED, resolve_footprint
-from ..io.common import BACKGROUNDS
+from ..io.images import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 EFFECTS = ("auto", "none")

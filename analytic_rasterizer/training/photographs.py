@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
-from ..io.common import opened_picture, optional_import
+from ..io.errors import optional_import
+from ..io.images import opened_picture
 
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
 TURNED = range(2, 9)  # its values for the others

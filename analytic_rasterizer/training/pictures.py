@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
-from ..io.common import naming
+from ..io.errors import naming
 from ..render.settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .parts import check_scales

@@ -1,4 +1,5 @@
-"""The position of a capture in the world: the offset of its coordinates, and the region that its cameras look at."""
+"""The position of a capture in the world: the offset of its coordinates, the region that its cameras look at, and
+random points to start from."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ ROUNDNESS = 20  # of an offset: it is a multiple of a power of ten that is at le
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of the focus
 # Depths of a focus, in distances of the cameras from their mean: the largest, and the one of cameras without a focus.
 FARTHEST_FOCUS, DEPTH_WITHOUT_FOCUS = 100, 10
+HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
 
 
 def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float, float] | None:
@@ -42,6 +44,16 @@ def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float
         middle = focus
     digits = -math.floor(math.log10(size / ROUNDNESS))
     return tuple(round(number, digits) + 0.0 for number in middle.tolist())
+
+
+def random_points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Positions (count, 3) in the cube from -1.3 to 1.3, where NeRF-synthetic scenes are, and grey, (count, 3) of 0.5.
+
+    Drawn by `seed`, on the CPU. Random colours, of which nothing is known, would only have to be unlearned.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
+    return HALF_EDGE * (2 * uniform - 1), torch.full_like(uniform, 0.5)
 
 
 def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -25,7 +25,7 @@ from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..optim import MOMENTS
 from .extent import extent_of
-from .model import enlarged
+from .rendering import enlarged
 from .trainer import Trainer
 
 _OPS = torch.ops.analytic_rasterizer

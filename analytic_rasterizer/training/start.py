@@ -13,10 +13,9 @@ from ..gaussians import Gaussians
 from .captures import Capture
 from .extent import seen_distance
 from .health import FAINTEST
-from .model import random_points
 from .options import TrainingOptions
 from .parts import BACKGROUNDS, RANDOM_BACKGROUND
-from .placement import focus_of, points_in_view
+from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
 
 

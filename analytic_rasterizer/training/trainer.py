@@ -24,10 +24,10 @@ from .captures import WHITE
 from .exposure import Exposures
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
-from .model import enlarged
 from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
+from .rendering import enlarged
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")

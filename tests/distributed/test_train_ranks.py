@@ -28,7 +28,7 @@ from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.losses import l1_ssim
 from analytic_rasterizer.optim import MOMENTS, FusedAdam
-from analytic_rasterizer.training import TrainingOptions, files, model, schedule, sharded
+from analytic_rasterizer.training import TrainingOptions, files, random_points, schedule, sharded
 from analytic_rasterizer.training.sharded import UNEVEN, Seen, ShardedTrainer
 
 WORLD = 3
@@ -517,7 +517,7 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
     state = checkpoint_in(tmp_path / "out")
     assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
     test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
-    start = Gaussians.from_points(*model.random_points(60, 0), 0)
+    start = Gaussians.from_points(*random_points(60, 0), 0)
     before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
     after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
     assert after > before + 2

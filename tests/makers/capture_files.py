@@ -10,8 +10,8 @@ from cli_extra import image
 
 from analytic_rasterizer import io
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
-from analytic_rasterizer.training import colmap
-from analytic_rasterizer.training import model as g
+from analytic_rasterizer.training import colmap, random_points
+from analytic_rasterizer.training import rendering as g
 
 
 def write_colmap(folder, views, points, colors, model=1, coefficients=None) -> None:
@@ -113,7 +113,7 @@ def turn(axis: int, angle: float) -> torch.Tensor:
 def truth_gaussians() -> Gaussians:
     """A few coloured Gaussians."""
     generator = torch.Generator().manual_seed(5)
-    points, _ = g.random_points(12, seed=5)
+    points, _ = random_points(12, seed=5)
     gaussians = Gaussians.from_points(points, torch.rand(12, 3, generator=generator), 0)
     gaussians = gaussians._replace(log_scales=torch.full((12, 3), 0.25).log())
     return gaussians._replace(logit_opacities=torch.full((12, 1), 3.0))

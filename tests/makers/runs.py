@@ -6,7 +6,7 @@ from dataclasses import fields
 import torch
 
 from analytic_rasterizer.training import CaptureSource, Run, TrainingOptions
-from analytic_rasterizer.training import model as g
+from analytic_rasterizer.training import rendering as g
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
 OF_RUN = inspect.signature(Run).parameters.keys() - {"device", "iterations", "seconds"}

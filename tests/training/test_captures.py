@@ -28,7 +28,6 @@ from train_extra import image
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, render_stages, training
 from analytic_rasterizer.training import captures, colmap, files, photographs, pictures, placement, run, undistortion
-from analytic_rasterizer.training import model as g
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
 
@@ -59,7 +58,7 @@ def test_colmap_pictures_of_the_same_name_in_several_folders(tmp_path, capsys, w
     """Each has a name and a picture of its own in the results."""
     folders = ["cam2/", "cam1/", "", "cam3/"]
     views = [replace(v, name=f"{folders[i % 4]}{i // 4:04d}") for i, v in enumerate(circle(12))]
-    points, colors = g.random_points(60, seed=5)
+    points, colors = training.random_points(60, seed=5)
     write(tmp_path / "scene" / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
     for folder in folders:
         (tmp_path / "scene" / "images" / folder).mkdir(parents=True, exist_ok=True)
@@ -1150,7 +1149,7 @@ def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
     assert found.offset == (500123.5, 4200456.8, 99.9) and not found.starts_in_view
     options = training.TrainingOptions(random_points=50)
     start, _ = run.first_gaussians(options, found, None)
-    expected = g.random_points(50, 0)[0].double() + torch.tensor(place, dtype=torch.float64)
+    expected = training.random_points(50, 0)[0].double() + torch.tensor(place, dtype=torch.float64)
     in_world = start.means.double() + torch.tensor(found.offset, dtype=torch.float64)
     torch.testing.assert_close(in_world, expected, rtol=0, atol=1e-5)
     for item, expected in zip(found.train, circle(10)):

@@ -12,7 +12,7 @@ from analytic_rasterizer.density import gradient, monte_carlo
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.training import TrainingOptions, trainer
-from analytic_rasterizer.training import model as g
+from analytic_rasterizer.training import rendering as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default
 add_noise = torch.ops.analytic_rasterizer.add_noise_.default

@@ -17,7 +17,6 @@ from train_extra import image
 
 from analytic_rasterizer import io, training
 from analytic_rasterizer.training import TrainingOptions, captures, evaluate, files
-from analytic_rasterizer.training import model as g
 
 sys.path.append(str(ROOT / "benchmarks"))
 import paper_tables
@@ -166,7 +165,7 @@ def photographs(tmp_path_factory):
     """Bonsai with photographs and their halves, as the data set comes, and flowers with the wrong folder."""
     folder = tmp_path_factory.mktemp("360") / "360_v2"
     views = circle(9, (48, 32))
-    points, colors = g.random_points(50, seed=5)
+    points, colors = training.random_points(50, seed=5)
     for scene, halves in (("bonsai", "images_2"), ("flowers", "images_8")):
         write_pictures(folder / scene / "images", views, opaque=True)
         (folder / scene / halves).mkdir()

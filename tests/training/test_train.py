@@ -35,7 +35,7 @@ from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.render.arguments import camera_arguments
 from analytic_rasterizer.render.seam import turn_of
 from analytic_rasterizer.training import TrainingOptions, captures, files, pictures, schedule
-from analytic_rasterizer.training import model as g
+from analytic_rasterizer.training import rendering as g
 from analytic_rasterizer.training.evaluation import evaluate, psnr
 
 # -------------------------------------------------------------------------------------- errors
@@ -238,7 +238,7 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
     log = [json.loads(line) for line in (tmp_path / files.LOG).read_text().splitlines()]
     assert [entry["step"] for entry in log] == [10, 100, 120]
     assert log[-1]["loss"] < 0.5 * log[0]["loss"]
-    start = evaluate(Gaussians.from_points(*g.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
+    start = evaluate(Gaussians.from_points(*training.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
     assert metrics["test"]["mean"]["psnr"] > start["mean"]["psnr"] + 3
     assert metrics["steps"] == 120 and metrics == json.loads((tmp_path / files.METRICS).read_text())
     assert {"1", "2", "mean"} == metrics["test"].keys() and len(metrics["test"]["1"]["views"]) == 3
@@ -882,7 +882,7 @@ def test_random_points_keep_to_the_limit(synthetic, tmp_path, density):
     """By default there are as many as it allows, and those of a start with so many."""
     run = make_run(synthetic, tmp_path, density=density, max_gaussians=130, random_points=0, iterations=75)
     assert run.options.random_points == 130 and run.points_found is None
-    assert torch.equal(run.trainer.gaussians.means.detach(), g.random_points(130, 0)[0])
+    assert torch.equal(run.trainer.gaussians.means.detach(), training.random_points(130, 0)[0])
     counts = []
     while run.progress.share < 1:
         run.trainer.step()
@@ -907,7 +907,7 @@ def test_number_of_random_points():
 def test_of_more_points_than_the_limit_some_are_drawn(capture, tmp_path, capsys, given):
     arguments = ["train", str(capture), "--images", "photographs", "--device", "cpu", "--iterations", "1"]
     arguments += ["--sh-degree", "0", "--no-evaluate", "--means-rate", "1e-30", "--means-rate-end", "1e-30"]
-    points, _ = g.random_points(60, seed=5)
+    points, _ = training.random_points(60, seed=5)
     if given:
         points = points + 1
         header = "ply\nformat ascii 1.0\nelement vertex 60\n" + "".join(f"property double {a}\n" for a in "xyz")
@@ -1091,7 +1091,7 @@ def test_seeds_reach_to_where_no_order_can_be_drawn():
         options = TrainingOptions(seed=seed)
         for number in (0, 2**24 - 1):  # of a pass
             assert schedule.PictureOrder(20, options)(20 * number)[1] == 1
-        assert len(g.random_points(2, seed)[0]) == 2
+        assert len(training.random_points(2, seed)[0]) == 2
     for seed in (-(2**39) - 1, 2**40):
         with pytest.raises(ValueError, match=rf"seed must be -2\^39 to 2\^40 - 1, got {seed}"):
             TrainingOptions(seed=seed)
@@ -1206,7 +1206,7 @@ def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, cap
 
 
 def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, capsys):
-    start = Gaussians.from_points(*g.random_points(60, 0), 0)
+    start = Gaussians.from_points(*training.random_points(60, 0), 0)
     scatter(start)
     io.save_scene(tmp_path / "start.ply", start)
     small = ["--iterations", "12", "--points", str(tmp_path / "start.ply")]

@@ -1,11 +1,10 @@
-"""How the Gaussians that are trained are rendered and differentiated, and where they start without points."""
+"""How the Gaussians that are trained are rendered: larger and averaged, or by several ranks together."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -15,8 +14,6 @@ from ..render.settings import GaussianRasterizationSettings
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
-
-HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
 
 
 def render(
@@ -74,13 +71,3 @@ def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRas
 def averaged(picture: Tensor, times: int) -> Tensor:
     """Means over squares of so many pixels, (3, H / times, W / times)."""
     return avg_pool2d(picture, times) if times > 1 else picture
-
-
-def random_points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Positions (count, 3) in the cube from -1.3 to 1.3, where NeRF-synthetic scenes are, and grey, (count, 3) of 0.5.
-
-    Drawn by `seed`, on the CPU. Random colours, of which nothing is known, would only have to be unlearned.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    uniform = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
-    return HALF_EDGE * (2 * uniform - 1), torch.full_like(uniform, 0.5)
