@@ -116,7 +116,6 @@ template <typename T> AR_HD void activate_vjp(const ActivateVjpParams<T>& p, int
   }
 }
 
-/// An axis of a Gaussian that is convolved with its filter.
 template <typename T> struct FilteredAxis {
   T scale;               ///< sqrt(s^2 + w^2) of scale s and width w
   T by_scale, by_width;  ///< its derivatives s / scale, w / scale; the first is also what is left of the peak
@@ -145,8 +144,7 @@ template <typename T> AR_HD void apply_filter_vjp(const FilterVjpParams<T>& p, i
   const FilteredAxis<T> x = filter_axis(s.x, width), y = filter_axis(s.y, width), z = filter_axis(s.z, width);
   const Vec3<T> shares = {x.by_scale, y.by_scale, z.by_scale}, by_width = {x.by_width, y.by_width, z.by_width};
   const Vec3<T> others = {y.by_scale * z.by_scale, z.by_scale * x.by_scale, x.by_scale * y.by_scale};
-  // By the share of each axis in the opacity, over the axis' scale. The share s / scale has the derivative
-  // by_width^2 / scale by s, and -share by_width / scale by the width. Without a filter both are zero.
+  // The share s / scale has the derivative by_width^2 / scale by s, and -share by_width / scale by the width.
   const Vec3<T> over_scales =
       width == T(0) ? Vec3<T>{} : Vec3<T>{others.x / x.scale, others.y / y.scale, others.z / z.scale};
   const Vec3<T> by_shares = (by_opacity * p.opacities[i]) * over_scales;

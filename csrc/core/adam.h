@@ -1,5 +1,5 @@
-// A step of Adam [Kingma and Ba 2015, Algorithm 1] for several tensors, each with its own learning rate and count of
-// steps. Epsilon is outside the root, as in torch.optim.Adam.
+// A step of Adam [Kingma and Ba 2015, Algorithm 1] for several tensors. Epsilon is outside the root, as in
+// torch.optim.Adam.
 #pragma once
 
 #include <cmath>
@@ -43,7 +43,7 @@ struct AdamPart {
   int64_t begin, end;
 };
 
-/// Makes work items of `numbers` numbers, and returns how many.
+/// Into items of `numbers` numbers. Returns how many.
 template <typename T> int64_t divide_work(AdamParams<T>& p, int64_t numbers) {
   p.first_item[0] = 0;
   for (int k = 0; k < p.count; ++k) p.first_item[k + 1] = p.first_item[k] + (p.tensors[k].n + numbers - 1) / numbers;

@@ -77,8 +77,8 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// Whether a support reaches boxes of one size, without division and root: in z = w (x - mean) the ellipse is a circle,
-/// compared with a bounding box of the box. It may say yes if the ellipse passes closely.
+/// Without division and root: in z = w (x - mean) the ellipse is a circle, compared with a bounding box of the box. It
+/// may say yes if the ellipse passes closely.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
@@ -126,13 +126,13 @@ template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid 
   return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width), grid);
 }
 
-/// Calls visit(tile row, range of tile columns).
+/// visit(tile row, range of tile columns).
 template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>& s, TileGrid grid, Visit&& visit) {
   const Range rows = clamp_range(rows_of(s), grid.height), tile_rows = tiles_of(rows, grid);
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// Sort as unsigned integers as depths >= 0 do. -0 counts as 0.
+/// Bits that sort as unsigned integers as depths >= 0 do. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
@@ -171,7 +171,7 @@ template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGr
   return found;
 }
 
-/// Calls visit(tile index), rows first, columns ascending.
+/// visit(tile index).
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
   for_each_tile_row(s, grid, [&](int row, Range columns) AR_HD_LAMBDA {
     for (int column = columns.first; column <= columns.last; ++column) visit(int64_t(row) * grid.columns() + column);

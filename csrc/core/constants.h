@@ -30,7 +30,7 @@ inline constexpr double kAlphaMax = 0.99;
 /// A sample stops before T falls below this.
 inline constexpr double kTransmittanceMin = 1e-4;
 
-/// In 3DGS's radius, half the difference of the eigenvalues is at least the root of this [px^4].
+/// In 3DGS's radius, half the eigenvalues' difference is at least the root of this [px^4].
 inline constexpr double kRadiusMinGap = 0.1;
 
 /// Variance of the unit pixel along each axis [px^2].

@@ -155,7 +155,7 @@ AR_HD double quotient(double a, double b) { return a / b; }
 template <typename T> AR_HD T inverse_power_of_two(T x) {
   using Bits = std::conditional_t<sizeof(T) == sizeof(uint32_t), uint32_t, uint64_t>;
   static_assert(std::numeric_limits<T>::is_iec559 && sizeof(T) == sizeof(Bits));
-  // Of the field of the exponent: its lowest bit, and its highest finite value.
+  // The exponent's lowest bit, and its highest finite value.
   constexpr Bits lowest = Bits(1) << (std::numeric_limits<T>::digits - 1);
   constexpr Bits field = (~Bits(0) >> 1) & ~(lowest - 1), highest = field - lowest;
   Bits bits;

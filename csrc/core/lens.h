@@ -1,5 +1,5 @@
-// Structs of a camera. Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur:
-// what lens and shutter add to a covariance in the image.
+// Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: what lens and
+// shutter add to a covariance in the image.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -11,7 +11,7 @@
 
 namespace ar {
 
-/// Bounds of a Gaussian's reach with a footprint (docs/internals/numerics.md, "Culling bound").
+/// docs/internals/numerics.md, "Culling bound".
 template <typename T> struct CullBounds {
   T variance;  ///< that the footprint adds [px^2]
   T level;     ///< of the support ellipse at opacity 1
@@ -209,7 +209,7 @@ AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, con
   return shape_splat(p, footprint, camera.grid, splat, support);
 }
 
-/// Also culls Gaussian i if its colour is not finite.
+/// Also culls if the colour is not finite.
 template <class Cam, typename T>
 AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintChoice footprint, SplatRow<T>& splat,
                   T& depth) {
@@ -321,7 +321,7 @@ template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, in
   }
 }
 
-/// For a Gaussian without pixels. `dL_dsh` may be null.
+/// `dL_dsh` may be null.
 template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};

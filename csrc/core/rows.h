@@ -36,7 +36,7 @@ AR_HD Vec3<T> shown_depth_vjp(const Cam& camera, Vec3<T> view, const RowShownGra
 /// Half the width and height of the ellipse where alpha is kAlphaMin, in whole px, as gsplat has them; its conic, and
 /// the opacity there.
 template <typename T> struct RowMeasure {
-  bool drawn;  ///< Whether the ellipse's rectangle meets the image, and the rules leave it.
+  bool drawn;  ///< The ellipse's rectangle meets the image, and the rules leave it.
   int x, y;
   Vec3<T> conic;  ///< 1/px^2
   T opacity;

@@ -48,7 +48,7 @@ template <int kMax, typename T> AR_HD void sh_basis(int degree, Vec3<T> d, T* ba
   }
 }
 
-/// Gradient of sum_k weight[k] basis[k](d), by three independent coordinates d.
+/// Of sum_k weight[k] basis[k](d), by three independent coordinates d.
 template <int kMax, typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T* weight) {
   Vec3<T> g = {T(0), T(0), T(0)};
   if (degree < 1) return g;

@@ -39,8 +39,8 @@ AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. In large images the pairs of
-/// spreading four would cost more than shorter lists save.
+/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. In large images more pairs would
+/// cost more than shorter lists save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }
@@ -89,7 +89,7 @@ enum class MeanSums : int32_t {
 
 /// Gradients by the members of Gaussians; null: not wanted.
 template <typename T> struct GaussianGrads {
-  /// Added to these arrays, and to the `dL_dsh` that project_vjp gets.
+  /// Whether gradients are added, also to the `dL_dsh` of project_vjp.
   static constexpr bool kAdd = false, kAddShs = false;
   Vec3<T>* means;
   Vec3<T>* scales;
@@ -103,7 +103,7 @@ template <typename T> struct GaussianGrads {
   MeanSums mean_sums;
 };
 
-/// Adds; without means2d.
+/// Gradients that are added to others; without means2d.
 template <typename T> struct AddedGrads : GaussianGrads<T> {
   static constexpr bool kAdd = true, kAddShs = true;
 };
@@ -123,7 +123,6 @@ template <class Element> struct Column {
 inline constexpr int kSplatWidth = 12;
 inline constexpr int kSplatColor = 9;
 
-/// An array of splats is a matrix of T.
 template <class F, typename T> struct alignas(16) Splat {
   Vec2<T> mean;  ///< px
   typename F::template Shape<T> shape;
@@ -132,7 +131,7 @@ template <class F, typename T> struct alignas(16) Splat {
   Vec3<T> color;
 };
 
-/// A Splat whose footprint is known at run time.
+/// Its footprint is known at run time.
 template <typename T> struct alignas(16) SplatRow {
   Vec2<T> mean;
   T shape[kShapeWidth];
@@ -153,7 +152,7 @@ template <typename T> struct Channels {
   AR_HD const T* row(int32_t splat) const { return data + (ids ? ids[splat] : splat) * stride; }
 };
 
-/// Unless it is three colours.
+/// Where `project` writes channels, unless they are three colours.
 template <typename T> struct ChannelRows {
   T* data;  ///< or null
   int64_t stride;

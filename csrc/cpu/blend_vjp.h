@@ -23,7 +23,7 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
-/// Gradient times what a splat shows. Channels after the third change no bit if their gradient is zero.
+/// Channels after the third change no bit if their gradient is zero.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
   const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };

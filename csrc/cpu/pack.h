@@ -166,7 +166,7 @@ AR_HD double sum(double a) { return a; }
 /// sum() of eight packs, to the bit.
 AR_HD void sum_lanes(const Pack (&packs)[8], float (&sums)[8]) {
 #if AR_LANES >= 8
-  // In the order of sum(). Each step halves the registers.
+  // In the order of sum().
   __m256 halves[4], pairs[2];
   for (int i = 0; i < 4; ++i) {
     const __m256 a = eight_lanes(packs[i]), b = eight_lanes(packs[i + 4]);

@@ -23,7 +23,7 @@ template <class P, typename T> struct TilePairs<P, T, true> {
   }
 };
 
-/// Positions of samples [px], from the centres of their pixels, and their cells. Empty unless P moves.
+/// Positions of samples [px] from the centres of their pixels. Empty unless P moves.
 template <class P, typename T, bool kMoves = P::kMoves> struct TilePlaces {};
 template <class P, typename T> struct TilePlaces<P, T, true> {
   using V = typename LanesOf<T>::Type;
@@ -118,7 +118,6 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
 
   AR_HD Bounds<V> bounds(int s) const { return samples_.bounds(s); }
 
-  /// Whether take() has more of pair k.
   AR_HD bool has(int32_t k) const { return entries_ != 0 && end_[-entries_].pair == k; }
 
   /// First of the pack of take().

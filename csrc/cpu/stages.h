@@ -179,7 +179,7 @@ template <typename T> struct Stages {
   const CameraStages<T>& of(const CameraView<T>& camera) const { return camera.lens ? full : plain; }
 };
 
-/// Of the best instruction set, or of ANALYTIC_RASTERIZER_ISA (baseline, avx2, avx512). double has the baseline.
+/// Of the best instruction set, or of ANALYTIC_RASTERIZER_ISA. double has the baseline.
 template <typename T> const Stages<T>& stages_of(int footprint);
 
 /// Of stages_of<float>.

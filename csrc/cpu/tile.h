@@ -114,7 +114,7 @@ template <class V, typename T> AR_HD Vec3<V> three_channels(const T* shown, bool
   return three ? Vec3<V>{V(shown[0]), V(shown[1]), V(shown[2])} : Vec3<V>{V(T(0)), V(T(0)), V(T(0))};
 }
 
-/// The packs that a splat reaches, and perhaps a few more.
+/// And perhaps a few more.
 template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& splat, const TileView& view) {
   using V = typename LanesOf<T>::Type;
   constexpr int kLanes = Packs<T>::kLanes, kRows = Packs<T>::kRows, kWidth = Packs<T>::kWidth;
@@ -156,7 +156,6 @@ inline constexpr int kPrefetch = 16;
 /// Prepared together, so that branches of the loops over pixels are known early.
 inline constexpr int kBatch = 16;
 
-/// For pixels counted from the tile's first.
 template <class P, typename T> AR_HD auto terms_in_tile(const Splat<P, T>& splat, const TileView& view) {
   const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
   return P::terms(splat.shape, splat.opacity, origin);

@@ -76,7 +76,7 @@ template <class Function> void visit_tiles(int footprint, TileGrid grid, Functio
   });
 }
 
-/// Channels that still/ and moment/ are compiled for, where there are few.
+/// What still/ and moment/ are compiled for.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 template <class T, class Function> void with_few_channels(const Channels<T>& channels, Function&& f) {
   if (!channels.data) return f(std::integral_constant<int, compiled_channels(true)>());
@@ -124,7 +124,7 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
   return route;
 }
 
-/// Channels of the next group; `left`: all that are left.
+/// `left`: all channels that are left.
 template <class F> constexpr int group_width(int left) {
   return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }

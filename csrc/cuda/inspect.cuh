@@ -20,7 +20,6 @@ __device__ inline float depth_of_splat(const InspectParams& params, int32_t id) 
                             : depth_of(load_camera(params.camera), mean);
 }
 
-/// Adds what the lanes of a warp show of a splat.
 __device__ inline void add_shown(const InspectParams& params, int32_t id, const Shown<float>& shown) {
   const int touched = __popc(__ballot_sync(kAllLanes, shown.weight > 0));
   if (touched == 0) return;
@@ -34,8 +33,7 @@ __device__ inline void add_shown(const InspectParams& params, int32_t id, const 
   atomicMax(&params.largest[id], largest);
 }
 
-/// A block per tile, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column, tiles of 4x4 a part of one
-/// subtile. F: the footprint.
+/// A block per tile, a warp per subtile. Tiles of 8x8 pixels have the subtiles of a column, tiles of 4x4 a part of one.
 template <class F, int kSide, Look kLook>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();

@@ -25,7 +25,7 @@ inline constexpr int kFewChannels = 4;
 /// Channels of a group, and of a last group.
 inline constexpr int kChannelGroup = 32, kSmallGroup = 8;
 
-/// Bits of a digit, and digits.
+/// Of the sort by depth: bits of a digit, and digits.
 inline constexpr int kDepthBits = 9, kDepthPasses = 4;
 inline constexpr int kDepthHistogramWords = kDepthPasses << kDepthBits;
 
@@ -213,7 +213,7 @@ void project(const ProjectParams& p, cudaStream_t stream);
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
 
-/// Of the sorts.
+/// Most items of a sort.
 int64_t max_items();
 
 /// Bytes, multiples of 16. The scratch of the sort by depth begins with histograms.

@@ -1,5 +1,4 @@
-// Sums, votes and searches over a warp, which all lanes must call; sums over a block; and loads, stores and copies of
-// single lanes.
+// Sums, votes and searches over a warp, which all lanes must call; sums over a block; loads, stores and copies.
 #pragma once
 
 #include <cstdint>
@@ -157,7 +156,6 @@ __device__ inline int take_first(uint32_t& set) {
   return first;
 }
 
-/// For numbers that are not read soon.
 __device__ inline void store_streaming(float4* to, const float4& value) {
 #if defined(__CUDA_ARCH__)
   __stcs(to, value);

@@ -193,7 +193,7 @@ struct ProjectArguments : BatchArguments {
   }
 };
 
-/// Camera c has counts[c] packed rows, from firsts[c] on.
+/// Of camera c: counts[c] packed rows, from firsts[c] on.
 struct PackedRanges {
   std::vector<int64_t> firsts, counts;
 
@@ -331,7 +331,7 @@ struct WeightArguments : FootprintArguments {
   }
 };
 
-/// An op writes to them. The schema marks each by its own letter.
+/// Written by an op; the schema marks each by its letter.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 template <char kLetter> struct WrittenTensor : Tensor {};
 

@@ -332,7 +332,7 @@ class CudaBackend final : public Backend {
     TORCH_CHECK(error == cudaSuccess, "CUDA error in ", stage, ": ", cudaGetErrorString(error));
   }
 
-  /// Sets the plan in `p` and `state`. Returns memory that must live until blend is launched.
+  /// Returns memory that must live until blend is launched.
   Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::Route& route, BlendState& state) const {
     const cuda::ListCut& cut = route.cut;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
@@ -381,7 +381,7 @@ class CudaBackend final : public Backend {
     return camera_grads;
   }
 
-  /// Writes pairs to the member `to` and sorts them by tile. Value: SlotPair or int32_t.
+  /// Value: SlotPair or int32_t.
   template <class Value>
   void make_pairs(cuda::EmitParams emit, Value* cuda::EmitParams::* to, cuda::PairFeedback feedback,
                   const PairMemory& memory, ListTensors& out, bool debug) const {

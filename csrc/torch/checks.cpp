@@ -1,6 +1,5 @@
 // The checks of checks.h for rendering with one camera: shapes, types and values of arguments, lists and saved tensors.
-// batches.cpp has those of several cameras, training_checks.cpp of training. find_footprint() and grid_of() are here
-// too, because they check a footprint's name and a picture's size.
+// find_footprint() and grid_of() are here too, because they check a footprint's name and a picture's size.
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>

@@ -25,7 +25,6 @@ void check(ActivateArguments& a);
 void check(FilterArguments& a);
 void check(ObserveArguments& a);
 void check(NoiseArguments& a);
-/// What the ops inside would find late, or by another name.
 void check(PictureArguments& a);
 void check(RowsPictureArguments& a);
 void check(CorrectArguments& a);

@@ -71,7 +71,7 @@ struct SplatMemory {
   }
 };
 
-/// Pairs while they are sorted by tile, without the result.
+/// Of pairs while they are sorted by tile.
 struct PairMemory {
   cuda::ZeroedMemory scratch;
   uint32_t* tiles[2];
@@ -88,7 +88,7 @@ struct PairMemory {
   }
 };
 
-/// Memory of blend while it runs, for up to `chunks` chunks.
+/// Of blend while it runs.
 struct PlanMemory {
   cuda::TileChunk* tail;
   int32_t *tile_order, *tile_planes, *tile_open, *open_tiles;

@@ -111,7 +111,7 @@ class PairGuesses {
  public:
   static constexpr int kSlots = 64;
 
-  /// `words`: [kSlots] in host memory that devices can write.
+  /// [kSlots] in host memory that devices can write.
   explicit PairGuesses(uint64_t* words) : words_(words) { std::fill(words_, words_ + kSlots, uint64_t(0)); }
 
   struct Frame {
@@ -158,7 +158,7 @@ class PairGuesses {
     PairGuess guess;
   };
 
-  /// The slot of a class, or the least recently used slot, emptied.
+  /// Or the least recently used slot, emptied.
   int slot_of(const ImageClass& images) {
     int oldest = 0;
     for (int k = 0; k < kSlots; ++k) {

@@ -1,5 +1,5 @@
-// Gradients with respect to a scene and its camera: allocates tensors that backends write, and lists them as ops return
-// them. `needs`: those of SceneTensors that are wanted.
+// Gradients of a scene and its camera: allocates tensors that backends write, and lists them as ops return them.
+// `needs`: the wanted SceneTensors.
 #pragma once
 
 #include <functional>
@@ -21,8 +21,8 @@ void set_camera_grads(Backend& backend, const Tensor& parts, const std::vector<b
 inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }
 std::vector<Tensor> list_of(Grads grads, const Tensor& like);
 
-/// Gradients with respect to the tensors of BatchArguments: summed over cameras for Gaussians, and stacked for cameras.
-/// `a`: after check_cameras(). `adjoint`: Backend::project_rows_vjp of one camera.
+/// Summed over cameras for Gaussians, stacked for cameras. `a`: after check_cameras(). `adjoint`:
+/// Backend::project_rows_vjp of one camera.
 std::vector<Tensor> gradients_of(Backend& backend, const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint);
 
@@ -32,7 +32,7 @@ bool may_be_rows_of(const Tensor& ids, int64_t count);
 /// (count,) int32: first + k for Gaussian ids[k], else -1. Ids may be out of range.
 Tensor row_of_gaussians(const Tensor& ids, int64_t count, int64_t first);
 
-/// Gradient with respect to the background of the first channels.
+/// By the background of the first channels.
 Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state, TileGrid grid);
 
 }  // namespace ar::ops

@@ -132,7 +132,7 @@ template <class Model> struct LensModel : CameraModelDefaults {
     return along(p, camera.focal.x * dL_djacobian.x, camera.lens.distortion).x +
            along(p, camera.focal.y * dL_djacobian.y, camera.lens.distortion).y;
   }
-  /// The derivatives along d of the gradients of image_point. They are the gradients of d . grad image_point.
+  /// The derivatives along d of the gradients of image_point.
   template <typename T> AR_HD_CALL static Rows<T> along(Vec3<T> p, Vec3<T> d, const T* distortion) {
     Line<T> k[kDistortion];
     for (int i = 0; i < kDistortion; ++i) k[i] = Line<T>(distortion[i]);

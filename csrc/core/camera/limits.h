@@ -11,7 +11,7 @@ namespace ar {
 inline constexpr int kLimitDirections = 64, kLimitAngles = 512;
 inline constexpr double kWidestPerspective = 89.5 / 180 * kPi, kWidestMeasured = 1.57;  ///< rad
 
-/// By what `reach` and `fold` of a model are measured.
+/// By what `reach` and `fold` are measured.
 enum class LimitKind : int32_t {
   kNone,
   kTangent,   ///< of an angle from the axis
@@ -29,7 +29,7 @@ template <typename T> AR_HD LimitKind limit_kind(const Lens<T>& lens) {
   return visit_model_at(lens.model, CameraModels(),
                         [](auto model) AR_HD_LAMBDA { return limit_kind_of<decltype(model)>(); });
 }
-/// Whether there is a fold to be found: the model has coefficients.
+/// Where the model has coefficients.
 AR_HD bool may_fold(LimitKind kind) { return kind == LimitKind::kTangent || kind == LimitKind::kAngle; }
 AR_HD double widest_angle(LimitKind kind) { return kind == LimitKind::kAngle ? kPi - 1e-3 : kWidestPerspective; }
 /// As the kernels read it.
@@ -38,7 +38,7 @@ AR_HD double measured(LimitKind kind, double angle) {
   return kind == LimitKind::kAngle ? angle : std::tan(min(angle, kWidestMeasured));
 }
 
-/// A camera at the origin whose picture is in focal lengths from the principal point, without limits.
+/// At the origin, with a picture in focal lengths from the principal point, without limits.
 AR_HD FullCamera<double> bare_camera(const Lens<double>& lens) {
   const double inf = std::numeric_limits<double>::infinity();
   FullCamera<double> camera = {};

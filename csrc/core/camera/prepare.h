@@ -8,7 +8,7 @@ namespace ar {
 
 inline constexpr double kClipNear = 0.01, kClipFar = 100;  ///< of clip-space z, which nothing reads
 
-/// What is known of the limits of lenses, rad; the rest is found (limits.h).
+/// The limits of lenses, rad; what is not known is found (limits.h).
 struct KnownLimits {
   double fold = 0, reach = 0;  ///< 0: not known
   int height = 0;              ///< of the picture [px]
@@ -35,7 +35,6 @@ struct MiddleOfView {
     project();
   }
   AR_HD Vec2<double> middle() const { return {-p.xy / p.xx, -p.yy / p.yx}; }
-  /// The gradient by axes and clip.
   AR_HD MiddleOfView vjp(Vec2<double> dL_dmiddle) const {
     MiddleOfView to = {};
     const auto add = [&](int axis, int k, double value, double dL_dvalue) {
@@ -254,7 +253,6 @@ template <class Source> AR_HD void write_lens(const Source& source, int c, doubl
   for (int k = 0; k < kLensWidth; ++k) to[k] = std::decay_t<decltype(to[0])>(from[k]);
 }
 
-/// What has to be found of a source before write_lens().
 template <class Source> bool finds_fold(const Source& source) {
   return may_fold(limit_kind(source.numbers)) && !(source.limits.fold > 0);
 }

@@ -14,7 +14,7 @@ inline constexpr double kLogistic3 = 0.07;
 /// Least standard deviation [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
-/// Along an axis of a splat's frame, t = u/sigma.
+/// Along an axis, t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
   T constant, square;  // f(b) - f(a) = constant + square t^2

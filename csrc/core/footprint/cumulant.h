@@ -36,7 +36,7 @@ template <typename T> struct CumulantAxis {
   }
 
   template <class V> AR_HD V capped(V p) const { return min(p * p, V(cap)); }
-  /// v less the part of h that depends on p. P = capped(p).
+  /// v less the part of h that depends on p.
   template <class V> AR_HD V subtract_from(V v, V P) const { return madd(-P, inner(P), v); }
   /// Half of dh/dp.
   template <class V> AR_HD V half_by_p(V p, V P) const { return p * madd(P, madd(V(-c6), P, quartic(P)), inner(P)); }

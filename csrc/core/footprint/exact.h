@@ -88,7 +88,7 @@ struct Exact : FootprintDefaults {
     Sym2<V> second;
   };
 
-  /// Standard deviations beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32.
+  /// Beyond it the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32.
   template <typename T> static constexpr double kTail = sizeof(T) == 4 ? 7 : 12;
   /// Longest panel for kManyNodes, in standard deviations of the integrand.
   static constexpr double kPanel = 3.3;

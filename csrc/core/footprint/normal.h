@@ -42,7 +42,7 @@ template <int N, typename T> struct GaussLegendre {
   }
 };
 
-/// For an interval of at most half a standard deviation (few), or up to 3.3 (many).
+/// For at most half a standard deviation (few), or 3.3 (many).
 template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
 template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
 

@@ -1,7 +1,7 @@
-// Kernels that make the lists of tiles; forward.cu launches them. By splat: count_depths counts splats, pairs and
-// digits of depths, and gives splats slots for gradients. By depth: emit_pairs writes a pair for each tile of a splat,
-// and emit_long_pairs those of splats whose tiles are not among 8x8, or of patches where room is short. By tile:
-// tile_offsets finds the first pair of each tile. The sorts between them are in sort.cuh.
+// Kernels that make the lists of tiles; forward.cu launches them. count_depths counts splats, pairs and digits of
+// depths, and gives splats slots for gradients. After the sort by depth (sort.cuh), emit_pairs writes a pair for each
+// tile of a splat, and emit_long_pairs those of splats whose tiles are not among 8x8, or of patches where room is
+// short. After the sort by tile, tile_offsets finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>
@@ -121,7 +121,6 @@ struct TileDigits {
   }
 };
 
-/// Writes pairs of a block, and counts digits.
 class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
@@ -341,7 +340,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// A warp per long splat, which emit_pairs would have in a few blocks; or one block for patches.
+/// A warp per long splat, or one block for patches.
 __global__ void __launch_bounds__(BinPolicy::kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();

@@ -35,7 +35,7 @@ struct ListCut {
 
   int at_least = 0, shares = 1, segment = 0;  ///< see long_from()
   int max_segments = 0, max_lists = 0;        ///< room; 0: no list is long
-  int longest_from = kNoList;                 ///< least pairs of the longest lists, a power of two
+  int longest_from = kNoList;                 ///< pairs of the longest lists: a power of two; 0: all lists
 
   /// Most segments if all lists have `pairs`. Not by room, so that the same lists are always cut alike.
   AR_HD int64_t segment_limit(int64_t pairs) const {

@@ -1,5 +1,4 @@
-// The forward pass for any number of channels: finds what a lane blends of the footprint, and launches blend_groups
-// (groups.cuh) for all groups of 32 or 8 channels.
+// Launches blend_groups (groups.cuh): the forward pass for any number of channels, in groups of 32 or 8.
 //
 // Tried and lost (H200, plant hd, `box` 1, 8 channels; docs/internals/log.md, "More than four channels"): backward,
 // batches of 32 splats (1214 instead of 930 us) or 128 (1495 us) for 64; a warp per splat in sum_channels, which took

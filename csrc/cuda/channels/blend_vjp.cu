@@ -1,5 +1,4 @@
-// The backward pass of one group of channels: finds what a lane blends of the footprint, and launches blend_groups_vjp
-// (groups_vjp.cuh).
+// Launches blend_groups_vjp (groups_vjp.cuh): the backward pass of one group of channels.
 #include "cuda/channels/groups_vjp.cuh"
 
 namespace ar::cuda {

@@ -1,6 +1,5 @@
 // Kernel blend_groups_vjp: the backward pass for one group of channels; later groups add to pair_grads. A block per
-// tile, a warp per subtile, walks the list back to front; lanes share channels as in groups.cuh. It writes pair_grads
-// and channel_sums.
+// tile, a warp per subtile, walks the list back to front; lanes share channels as in groups.cuh.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
 // for them the first group makes all sums of shapes, and reads the channels of all groups.
@@ -26,7 +25,7 @@ template <class F, int C> struct GroupVjpShared {
   uint8_t reach[kBatch];
 };
 
-/// Of one sample of this lane's pixels, in its channels of the group from `first` on.
+/// Of one sample of this lane's pixels, in its channels.
 template <class F, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
@@ -39,7 +38,7 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
   return g;
 }
 
-/// Channels [first, first + C). F: what a lane blends. kWithShape: makes sums of shapes too.
+/// F: what a lane blends. kWithShape: makes sums of shapes too.
 template <class F, int C, bool kWithShape>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
@@ -94,7 +93,6 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     transmittance[s] = pixel.inside ? params.transmittance[sample_index<F>(pixel, s)] : 1;
     farther[s] = through;
   }
-  // The splat of this thread in the batch that ends at k1, or -1.
   const auto splat_of_batch = [&](int k1) {
     const int k = max(k1 - kBatch, 0) + int(threadIdx.x);
     return threadIdx.x < kBatch && k < k1 ? list.splat(k) : -1;

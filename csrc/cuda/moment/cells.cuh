@@ -15,7 +15,7 @@
 
 namespace ar::cuda {
 
-/// With kClaimed.
+/// The group of the calling warp, with kClaimed.
 __device__ inline int& claimed_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
@@ -42,7 +42,7 @@ struct CellLayout {
     if constexpr (kClaimed) return claimed_group();
     return (int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32) / kWarpsOfGroup;
   }
-  /// Number of the group's pixel i in the tile, row by row.
+  /// Of the group's pixel i in the tile, row by row.
   __device__ static int pixel_number(int i) {
     const int g = group();
     return (g / kColumns * kHigh + i / kWide) * kSide + g % kColumns * kWide + i % kWide;
@@ -103,7 +103,6 @@ template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, cons
   return terms;
 }
 
-/// MovingSamples::kTogether for lists that are not cut.
 template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide < kMovingTile;
 
 /// A checkpoint has the transmittance and position of each sample of the tile. With kTogether it is [3, kTilePixels,

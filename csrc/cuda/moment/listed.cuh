@@ -1,8 +1,8 @@
-// Kernels filter and listed_blend: the forward pass for lists that are cut into segments. In a small image of a large
-// scene, a tile may have hundreds of thousands of splats, most of them smaller than a pixel. So `filter` tests every
-// pair against every pixel of its tile, and writes bits to reach_words. `listed_blend` composites in a pixel only
-// splats that reach it, from a queue (queue.cuh), or walks those that reach any of a warp's few pixels. It writes what
-// moving_blend writes for other lists, but for checkpoints within later segments, which segment_maps stores.
+// Kernels filter and listed_blend: the forward pass for lists that are cut into segments. A tile may have hundreds of
+// thousands of splats, most of them smaller than a pixel. So `filter` tests every pair against every pixel, and writes
+// bits to reach_words. `listed_blend` composites in a pixel only splats that reach it, from a queue (queue.cuh), or
+// walks those that reach any of a warp's few pixels. It writes what moving_blend writes for other lists, but for
+// checkpoints within later segments, which segment_maps stores.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -69,7 +69,6 @@ __global__ void __launch_bounds__(MomentPolicy::kFilterPiece) filter_kernel(cons
   }
 }
 
-/// For a warp of up to kMostPixels pixels.
 template <class F, int C, int kMostPixels> struct ListedStage {
   TileSplat<F, C> splats[32];
   int32_t ids[kListedBatch];
@@ -108,7 +107,6 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
-/// A warp walks the splats that reach any of its pixels.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, const CutList& cut, const TileList& list,
                              Stage& stage) {

@@ -18,7 +18,6 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   __device__ static int first_sample() {
     return int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + lane_id() % Base::kLanes / kAhead;
   }
-  /// Of this lane, among sharers().
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
   /// Lanes with the same sample.
@@ -156,7 +155,6 @@ template <class F, int C, class Layout> struct QueuedSplats {
     }
     queues.begin += uint32_t(next_n);
   }
-  /// `light`: the transmittance after the steps before.
   ///
   /// The comparison is never true: level > 0, and x_given_y >= 0. It keeps these registers in use until the splat
   /// arrives. `light` makes the compiler compare after the steps.

@@ -1,6 +1,6 @@
 // Kernel segment_vjp: the last step of the backward pass for lists that are cut. A block claims a segment and goes back
 // through it in batches. In each batch its warps claim groups of pixels, which are unequal work. adjoint_maps keeps the
-// Adjoints from batch to batch. It writes rows of pair_grads and channel_sums.
+// Adjoints from batch to batch.
 #pragma once
 
 #include <algorithm>

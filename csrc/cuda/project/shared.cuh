@@ -1,5 +1,4 @@
-// What the blocks of projection keep in shared memory, forward and backward: the camera, and a row of coefficients of
-// harmonics for each Gaussian. And how these kernels are launched.
+// What the kernels of projection share: the camera and rows of harmonics in shared memory, and how they are launched.
 #pragma once
 
 #include <algorithm>
@@ -98,7 +97,7 @@ template <int kDegree> struct ShRows {
   }
 };
 
-/// A thread for each of n rows, in at most `most_blocks` blocks.
+/// A thread for each of n rows.
 template <class Params>
 void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream, unsigned most_blocks = ~0u) {
   if (n > 0)

@@ -1,6 +1,6 @@
-// What blend_front and the tail share beside staged splats: addresses of a pixel's checkpoints (PixelCheckpoints,
-// TransmittancePlanes), store_pixel(), which writes a finished pixel to the images, and accumulate_farther(), which
-// turns the checkpoints into where blend_vjp starts.
+// What blend_front and the tail share: addresses of a pixel's checkpoints (PixelCheckpoints, TransmittancePlanes),
+// store_pixel(), which writes a finished pixel, and accumulate_farther(), which makes the checkpoints where blend_vjp
+// starts.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"

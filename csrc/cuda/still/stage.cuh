@@ -1,5 +1,5 @@
-// How blend_front and the tail composite: a block stages splats, lists those that reach each warp's pixels, and
-// composite_all() blends them into the pixel of a lane.
+// How blend_front and the tail composite: a block stages splats, each warp lists those that reach its pixels, and
+// composite_all() blends them.
 #pragma once
 
 #include <type_traits>

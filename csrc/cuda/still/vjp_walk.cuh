@@ -91,7 +91,6 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   }
 }
 
-/// F: what a lane blends. C: channels. kMeans: with MeanSums.
 template <class F, int C, bool kMeans> class ChunkWalk {
  public:
   __device__ __forceinline__ ChunkWalk(const BlendVjpParams& params, const VjpChunk& chunk, LanePixels<F, C>& pixels,
@@ -106,7 +105,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       uint32_t reach = 0;
       Mat2<float> mean_map = {0, 0, 0, 0};
       __syncwarp();  // all have read the last batch
-      // A lane per pair. As a function it takes more instructions.
+      // A lane per pair.
       Splat<F, float> own;
       int32_t id = 0, row = 0;
       if (k < k1) {
@@ -138,7 +137,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
  private:
   static constexpr int S = F::kSamples, kSumCount = 6 + C;
 
-  /// Farthest first. k0: first pair of the batch. `mean_map`: of the lane's own pair.
+  /// k0: first pair of the batch. `mean_map`: of the lane's own pair.
   template <MeanSums kKind> __device__ void walk_listed(int k0, int listed, const Mat2<float>& mean_map) {
     if constexpr (kHoldsSamples<C>) {
       for (int n = 0; n < listed; n += PairSums::kPairs) {
@@ -232,7 +231,6 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Sums the stored values of `count` listed splats from `from` on.
   __device__ void sum_pairs(int from, int count) {
     __syncwarp();
     float four[4], ninth;

@@ -2,8 +2,8 @@
 // derivatives and sums of blocks, `loss` adds these sums up in a fixed order, and `ssim_vjp` makes the gradient of the
 // image from the partial derivatives.
 //
-// A block copies what the windows of its pixels reach to shared memory, sums along rows, then along columns. A thread
-// makes kRun neighbouring sums from registers, to load less from shared memory.
+// Sums go along rows, then along columns, in shared memory. A thread makes kRun neighbouring sums from registers, to
+// load less.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
@@ -92,8 +92,7 @@ __device__ void for_each_pixel(Position position, int height, int width, const B
   }
 }
 
-/// image, target, map: [planes, height, width]; partials: [kSsimPartials, planes, height, width]. block_sums: [blocks,
-/// 2] for sums of |x - y| and of the similarity. The last three may be null. Target: T or uint8_t.
+/// block_sums: [blocks, 2] for sums of |x - y| and of the similarity, or null. Target: T or uint8_t.
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Target> p, T* block_sums) {
   wait_for_earlier_kernels();
@@ -167,7 +166,6 @@ __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, 
   if (threadIdx.x == 0) *p.loss = combined_loss(p, sums[0], sums[1]);
 }
 
-/// As ssim_kernel; dL_dmap, dL_dimage: [planes, height, width].
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<T, Target> p) {
   wait_for_earlier_kernels();

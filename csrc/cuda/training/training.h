@@ -1,6 +1,5 @@
-// What torch/training_cuda.cpp calls for a training step besides rendering; each function is in the file of its name.
-// Pointers are device memory. Nothing waits for the device. Bits do not depend on the order of blocks. T: float or
-// double.
+// The kernels of a training step besides rendering. Pointers are device memory. Nothing waits for the device. Bits do
+// not depend on the order of blocks. T: float or double.
 #pragma once
 
 #include <cuda_runtime_api.h>
