@@ -165,6 +165,8 @@ class TrainingOptions:
     """
 
     footprint: str = SceneOptions.footprint
+    first_footprint: str = SceneOptions.first_footprint
+    footprint_from: float = SceneOptions.footprint_from
     scales: tuple[int, ...] = PictureOptions.scales
     scale_repeats: tuple[int, ...] = PictureOptions.scale_repeats
     downsampling: str = PictureOptions.downsampling

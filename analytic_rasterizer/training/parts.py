@@ -72,6 +72,16 @@ class SceneOptions(Options):
         metavar="NAME[:k=v,..]",
         main=True,
     )
+    first_footprint: str = option(
+        "",
+        "Footprint until `footprint_from`, cheaper than the one that is trained for. Without any: `footprint` from the "
+        "start. `effects` may choose it.",
+        metavar="NAME[:k=v,..]",
+        main=True,
+    )
+    footprint_from: float = option(
+        0.9, "Time from which on pictures are rendered with `footprint`.", TIME, metavar="T", main=True
+    )
     sh_degree: int = option(
         3,
         "Highest degree of the spherical harmonics, 0 to 3.",
@@ -84,7 +94,9 @@ class SceneOptions(Options):
     filter_3d: bool = option(False, "Whether Gaussians are widened by the 3D filter of Mip-Splatting.", main=True)
 
     def __post_init__(self):
-        object.__setattr__(self, "footprint", str(resolve_footprint(str(self.footprint))))
+        for name in ("footprint", "first_footprint"):
+            value = str(getattr(self, name))
+            object.__setattr__(self, name, str(resolve_footprint(value)) if value or name == "footprint" else "")
         super().__post_init__()
 
 

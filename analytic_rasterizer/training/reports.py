@@ -73,9 +73,10 @@ class Display:
 
 
 def figures_of(entry: dict[str, Any]) -> dict[str, str]:
-    """Loss, PSNR and number of Gaussians of an entry of the log, as they are shown."""
+    """Loss, PSNR and number of Gaussians of an entry of the log, as they are shown; the footprint where it changes."""
     quality = "" if entry["psnr"] is None else f"{entry['psnr']:.1f}"
-    return {"loss": f"{entry['loss']:.4f}", "PSNR": quality, "Gaussians": f"{entry['gaussians']:,}"}
+    figures = {"loss": f"{entry['loss']:.4f}", "PSNR": quality, "Gaussians": f"{entry['gaussians']:,}"}
+    return figures | ({"footprint": entry["footprint"]} if "footprint" in entry else {})
 
 
 def describe(entry: dict[str, Any]) -> str:

@@ -277,6 +277,7 @@ class Run:
             "psnr": quality,
             "gaussians": self.count(),
             "dropped": self.trainer.dropped,
+            **({"footprint": self.trainer.footprint} if self.options.first_footprint else {}),
         }
         self.history.append(entry)
         if self.ranks.is_first:

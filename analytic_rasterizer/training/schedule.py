@@ -106,6 +106,13 @@ class PictureOrder:
         return self.pairs[self.drawn[number][place]]
 
 
+def footprint_at(step: int, share: float, options: TrainingOptions) -> str:
+    """The footprint in use after so many steps."""
+    time = options.footprint_from
+    over = step >= time if time > 1 else share >= time
+    return options.footprint if over or not options.first_footprint else options.first_footprint
+
+
 def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:
     """Degree of the harmonics in use after so many steps."""
     return min(options.sh_degree, max(step // options.sh_every, int(share / SH_SHARE)))

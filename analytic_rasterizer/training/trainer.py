@@ -28,7 +28,7 @@ from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
 from .rendering import enlarged
-from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
+from .schedule import PictureOrder, Progress, footprint_at, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
@@ -121,8 +121,9 @@ class Trainer:
         self.losses: list[Tensor] = []
         self._last: tuple[Tensor, Tensor, Tensor | None] | None = None  # picture, target and mask of the last step
         self.dropped, self.warnings = 0, []
-        self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
-        self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
+        # Footprint and degree of the harmonics, and the settings with them.
+        self._resolved: tuple[tuple[str, int], dict] | None = None
+        self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same settings
         if options.filter_3d:
             self._compute_filter()
 
@@ -315,11 +316,18 @@ class Trainer:
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""
 
+    @property
+    def footprint(self) -> str:
+        """That of the next step."""
+        return footprint_at(self.progress.step, self.progress.share, self.options)
+
     def _settings(self) -> dict:
-        """Settings of all pictures, with the degree of the harmonics that is due."""
-        degree = sh_degree_at(self.progress.step, self.progress.share, self.options)
-        if self._resolved is None or self._resolved[0] != degree:
-            self._resolved = degree, self.pictures.resolve(footprint=self.options.footprint, sh_degree=degree)
+        """Settings of all pictures, with the footprint and the degree of the harmonics that are due."""
+        due = self.footprint, sh_degree_at(self.progress.step, self.progress.share, self.options)
+        if self._resolved is None or self._resolved[0] != due:
+            if self._resolved is not None and self._resolved[0][0] != due[0] and self.device.type == "cuda":
+                torch.cuda.empty_cache()  # buffers of another footprint have other sizes
+            self._resolved = due, self.pictures.resolve(footprint=due[0], sh_degree=due[1])
             self._cameras = {}
         return self._resolved[1]
 
@@ -328,10 +336,13 @@ class Trainer:
 
     @torch.no_grad()
     def warm_up(self) -> None:
-        """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
-        for scale, settings in self._settings().items():
-            background = settings[0].bg if self.random_background else None
-            self._differentiate_picture(Shown(scale, 0, settings[0], background))
+        """Renders and differentiates a picture of each scale and footprint without a step, so that no step loads
+        kernels."""
+        for footprint in {self.footprint, self.options.footprint}:
+            for scale, settings in self._settings().items():
+                background = settings[0].bg if self.random_background else None
+                self._differentiate_picture(Shown(scale, 0, settings[0]._replace(footprint=footprint), background))
+                self._cameras = {}
         self._last = None
 
     def take_losses(self) -> list[float]:
