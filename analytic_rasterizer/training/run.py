@@ -326,8 +326,7 @@ class Run:
         try:
             yield
         finally:
-            within = sum(self.phases.values()) - others
-            self.phases[name] += time.perf_counter() - began - within
+            self.phases[name] += time.perf_counter() - began - (sum(self.phases.values()) - others)
 
     def _whole(self, scene: Gaussians, name: str) -> Gaussians:
         """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others.
