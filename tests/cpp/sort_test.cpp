@@ -55,6 +55,16 @@ TYPED_TEST(SortTest, NeighboursAndPowersOfTwo) {
   this->expect_stable_order(depths);
 }
 
+// A digit in which the keys of one thread agree, and those of another do not.
+TYPED_TEST(SortTest, PartsThatDiffer) {
+  Random random(3);
+  std::vector<TypeParam> depths(10000, TypeParam(0));
+  for (int i = 0; i < 5000; ++i) depths[i] = TypeParam(random.log_uniform(1e-30, 1e30));
+  this->expect_stable_order(depths);
+  std::reverse(depths.begin(), depths.end());
+  this->expect_stable_order(depths);
+}
+
 // Alone, where every key has the same digits but for the sign, and among others.
 TYPED_TEST(SortTest, ZerosOfBothSignsAreEqual) {
   this->expect_stable_order({TypeParam(0), TypeParam(-0.0), TypeParam(0), TypeParam(-0.0)});

@@ -135,10 +135,10 @@ def test_limit_rises_evenly_and_lets_the_largest_gradients_grow():
     assert len(control.gaussians.means) == 7
 
 
-@pytest.mark.parametrize("step, kept", [(3000, [SMALL, HUGE]), (3100, [SMALL])])
+@pytest.mark.parametrize("step, kept", [(3000, [SMALL, LARGE, HUGE]), (3100, [SMALL, LARGE])])
 def test_large_gaussians_go_after_the_first_reset(step, kept):
-    control = make_control([SMALL, HUGE], [0.5, 0.5])
-    after_step(control, [0.0, 0.0], step)
+    control = make_control([SMALL, LARGE, HUGE], [0.5] * 3)
+    after_step(control, [0.0] * 3, step)
     assert control.gaussians.log_scales[:, 0].exp().tolist() == pytest.approx(kept, rel=0.02)
 
 

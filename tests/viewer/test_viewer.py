@@ -129,8 +129,9 @@ def test_the_first_view_stands_upright_before_the_scene_and_above_its_floor(make
     meta = viewer.pack_scene(make()).meta
     w2c = torch.tensor(meta["views"][0]["w2c"]).reshape(4, 4)
     up, ahead = torch.tensor(up).double(), torch.tensor(ahead).double()
-    right, down, forward = w2c[:3, :3].double()
-    torch.testing.assert_close(torch.linalg.cross(down, forward), right)  # a rotation
+    rotation = right, down, forward = w2c[:3, :3].double()
+    torch.testing.assert_close(torch.linalg.cross(down, forward), right)
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), rtol=0, atol=1e-6)
     assert down @ up < -0.9 and forward @ ahead > 0.9 and abs(right @ up) < 1e-6
     eye = -w2c[:3, :3].double().T @ w2c[:3, 3].double() - torch.tensor(meta["center"])
     assert above * eye.norm() < eye @ up < 0.4 * eye.norm()
