@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from ..training import (
     save_pictures,
 )
 from ..training.captures import IMAGES, TEST_PERIOD, Capture
-from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES
+from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES, about_correction, measured_in_words
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.parts import check_scales
@@ -162,9 +163,8 @@ def run_on(ranks: Ranks, args) -> None:
     pictures_folder = writable_folder(out / "evaluation")
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
-    colors = {"color_corrected": options.exposure != "none"}
     for footprint in dict.fromkeys(str(choice.footprint) for choice in choices):
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common, **colors)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common, color_corrected=True)
         if args.pictures > 0:
             save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
@@ -173,7 +173,7 @@ def run_on(ranks: Ranks, args) -> None:
         written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
-        print(format_results(results, protocol.scales))
+        print(format_results(results, protocol.scales, options.exposure != "none"))
 
 
 def background_for(found: io.FoundScene, protocol: Protocol, capture: Capture, given) -> tuple[float, float, float]:
@@ -216,12 +216,20 @@ def part_of(scene: Gaussians, ranks: Ranks) -> Gaussians:
     return scene.rows(ranks.part_of(even_counts(scene.count, ranks.world)))
 
 
-def format_results(results: dict[str, dict], scales: tuple[int, ...]) -> str:
-    """A row per footprint and measure, with a column per scale and one for the mean."""
+def format_results(results: dict[str, dict], scales: tuple[int, ...], exposures_vary: bool = False) -> str:
+    """A row per footprint and measure, with a column per scale and one for the mean; over how many pictures the means
+    are, and why there are two PSNR, of which the corrected one is first where exposures vary."""
     rows = []
+    measures = (COLOR_CORRECTED, *MEASURES) if exposures_vary else (*MEASURES, COLOR_CORRECTED)
     for footprint, measured in results.items():
-        for measure in (m for m in (*MEASURES, COLOR_CORRECTED) if m in measured["mean"]):
+        for measure in (m for m in measures if m in measured["mean"]):
             heading, layout = HEADINGS[measure]
             values = [measured[key][measure] for key in (*map(str, scales), "mean")]
-            rows.append([footprint, heading, *(layout.format(value) for value in values)])
-    return format_table(["footprint", "", *(f"1/{scale}" for scale in scales), "mean"], rows)
+            rows.append([footprint, heading, *("-" if math.isnan(value) else layout.format(value) for value in values)])
+    table = format_table(["footprint", "", *(f"1/{scale}" for scale in scales), "mean"], rows)
+    first = next(iter(results.values()))  # masks are the same for all
+    said = {f"1/{scale}": measured_in_words(first[str(scale)]) for scale in scales}
+    if len(set(said.values())) == 1:
+        said = {"means": next(iter(said.values()))}
+    over = "; ".join(f"{name} over {words}" for name, words in said.items())
+    return "\n".join([table, over, about_correction(exposures_vary)])

@@ -15,7 +15,7 @@ from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
-from ..training.evaluation import COLOR_CORRECTED
+from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
 from ..training.reports import process_age
@@ -195,10 +195,19 @@ def finish(training: Run, complete: bool, args) -> None:
     if not args.no_evaluate:
         metrics = training.evaluate()
         say(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
-        for scale, values in metrics.get("test", {}).items():
-            name = scale if scale == "mean" else f"1/{scale}"
-            best = values.get(COLOR_CORRECTED)
-            after = "" if best is None else f"; after the best affine colour of each picture: PSNR {best:.2f} dB"
-            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}{after}")
+        tested, vary = metrics.get("test", {}), training.options.exposure != "none"
+        for scale, values in tested.items():
+            say(test_line(scale, values, vary))
+        if tested:
+            say(about_correction(vary))
     if training.ranks.is_first:
         print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in training.phases.items()), file=sys.stderr)
+
+
+def test_line(scale: str, values: dict, vary: bool) -> str:
+    """What the test pictures of a scale say, or all scales ("mean"). The corrected number is first where exposures
+    `vary`."""
+    name = "mean over scales" if scale == "mean" else f"1/{scale}, {measured_in_words(values)}"
+    corrected = f"after the best affine colour of each picture: PSNR {values[COLOR_CORRECTED]:.2f} dB"
+    plain = f"PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}"
+    return f"test, {name}: " + (f"{corrected}; as rendered: {plain}" if vary else f"{plain}; {corrected}")

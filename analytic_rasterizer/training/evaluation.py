@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -32,13 +33,11 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8.
 
-    With a mask (H, W) both images are multiplied by it already, and its sum is what the mean is over.
+    With a mask (H, W) in [0, 1] the error of each pixel counts by it; NaN where nothing counts.
     """
     if target.dtype == torch.uint8:
         target = target.to(image.dtype) / 255
-    error = (image.clamp(0, 1) - target).square()
-    mean_error = error.mean() if mask is None else error.sum() / (len(error) * mask.square().sum())
-    return decibels(mean_error)
+    return decibels(_mean((image.clamp(0, 1) - target).square(), mask))
 
 
 def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False) -> Perceptual:
@@ -95,9 +94,10 @@ def evaluate(
         **options: Further settings.
 
     Returns:
-        Over what counts where pictures have masks; LPIPS of pictures that are black elsewhere. By scale, as text, and
-        "mean" over scales: {"psnr", "ssim", "lpips"}; scales also have "views", a list with
-        the same for each view.
+        Over what counts where pictures have masks; LPIPS of pictures times their masks. By scale, as text, and "mean"
+        over scales: {"psnr", "ssim", "lpips"}. Scales also have "views", a list with the same for each view, and
+        "measured", the number of views that the means are over: views of which nothing counts have NaN, and are left
+        out. The mean of no view is NaN.
 
     Raises:
         ValueError: There are no pictures.
@@ -112,31 +112,63 @@ def evaluate(
         for view, image in rendered(gaussians, settings, supersampling, ranks):
             pictures.expect((later, scale) for later in range(view, len(settings), ranks.world))
             mask = pictures.mask(scale, view)
-            image, truth = counted(image.clamp(0, 1), pictures.truth(scale, view), mask)
+            image, truth = image.clamp(0, 1), pictures.truth(scale, view)
             values = [psnr(image, truth, mask), _mean_ssim(image, truth, mask)]
             if lpips is not None:
-                values.append(lpips(image, truth).reshape(()))
+                values.append(lpips(*counted(image, truth, mask)).reshape(()))
             if color_corrected:
-                best = corrected(image, best_exposure(image, truth, mask))
-                values.append(psnr(best if mask is None else best * mask, truth, mask))
+                values.append(psnr(corrected(image, best_exposure(image, truth, mask)), truth, mask))
             measured[view] = torch.stack(values)
+            if mask is not None:
+                measured[view] = torch.where(mask.any(), measured[view], math.nan)
         own = dict(zip(measured, torch.stack(list(measured.values())).tolist() if measured else []))
         of_views = {view: values for of_rank in ranks.exchange(own) for view, values in of_rank.items()}
         views = [dict(zip(names, of_views[view])) for view in range(len(settings))]
-        results[str(scale)] = _means(views) | {"views": views}
+        known = sum(not math.isnan(of_view[names[0]]) for of_view in views)
+        results[str(scale)] = _means(views, names) | {"measured": known, "views": views}
     pictures.close()
-    results["mean"] = _means([{k: v for k, v in of_scale.items() if k != "views"} for of_scale in results.values()])
+    results["mean"] = _means(list(results.values()), names)
     return results
 
 
 def _mean_ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """Of the pixels that count, by their masks; where nothing counts both pictures are black for its windows."""
     if mask is None:
         return ssim(image, target)
-    return (ssim(image, target, "none") * mask).sum() / (len(image) * mask.sum())
+    shown = (mask > 0).to(image.dtype)
+    return _mean(ssim(*counted(image, target, shown), "none"), mask)
 
 
-def _means(rows: list[dict[str, float]]) -> dict[str, float]:
-    return {key: mean(row[key] for row in rows) for key in rows[0]}
+def _mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean of values (C, H, W), to which each pixel counts by its mask, once."""
+    return values.mean() if mask is None else (values * mask).sum() / (len(values) * mask.sum())
+
+
+def _means(rows: list[dict[str, Any]], names: list[str]) -> dict[str, float]:
+    """Of the rows that have a value."""
+    known = {name: [row[name] for row in rows if not math.isnan(row[name])] for name in names}
+    return {name: mean(values) if values else math.nan for name, values in known.items()}
+
+
+def measured_in_words(of_scale: dict[str, Any]) -> str:
+    """How many views the means of a scale are over: "12 pictures", or "11 of 12 pictures, nothing counts in the
+    others"."""
+    known, count = of_scale["measured"], len(of_scale["views"])
+    pictures = f"{count} picture{'s' * (count != 1)}"
+    return pictures if known == count else f"{known} of {pictures}, nothing counts in the others"
+
+
+def about_correction(exposures_vary: bool) -> str:
+    """Why there are two numbers, in a line; the corrected one comes first where the training corrected exposures."""
+    if exposures_vary:
+        return (
+            "test photographs keep their own exposures, which no scene has: the number after the best affine colour of "
+            "each picture counts"
+        )
+    return (
+        "the number after the best affine colour of each picture leaves out differences of exposure: it compares with "
+        "trainings that correct them"
+    )
 
 
 def rendered(
@@ -169,7 +201,8 @@ def save_pictures(
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> list[Path]:
-    """Truth, rendering, and their difference times ERROR_GAIN side by side, for `count` views spread over all.
+    """Truth, rendering, and their difference times ERROR_GAIN side by side, for `count` views spread over all. The
+    difference counts by the mask.
 
     Args:
         folder: To write to.
@@ -187,7 +220,8 @@ def save_pictures(
         of_scale = [folder / f"{name}_{scale}_{pictures.views[view].name}.png" for view in chosen]
         for place, image in rendered(gaussians, [settings[view] for view in chosen], supersampling, ranks):
             image, truth = image.clamp(0, 1), pictures.truth(scale, chosen[place])
-            row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
+            mask, error = pictures.mask(scale, chosen[place]), ERROR_GAIN * (image - truth).abs()
+            row = torch.cat([truth, image, error if mask is None else error * mask], dim=2)
             io.save_image(of_scale[place], row)
         files += of_scale
     return files

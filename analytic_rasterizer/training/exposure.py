@@ -81,12 +81,16 @@ def corrected(image: Tensor, exposure: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def best_exposure(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """(3, 4) that brings the picture nearest to its target by least squares, in float64; of what a mask counts."""
+    """(3, 4) that brings the picture nearest to its target by least squares, in float64.
+
+    The error of each pixel counts by the mask (H, W), once; the identity where nothing counts.
+    """
     pixels, wanted = (t.flatten(1).double() for t in (image, target))
     weights = torch.ones_like(pixels[:1]) if mask is None else mask.flatten()[None].double()
-    rows = torch.cat([pixels, torch.ones_like(pixels[:1])]) * weights
+    rows = torch.cat([pixels, torch.ones_like(pixels[:1])])
+    weighted = rows * weights
     # A flat picture leaves the solution open; the identity is then as good as any other.
-    damping = 1e-9 * weights.square().sum() * torch.eye(4, dtype=rows.dtype, device=rows.device)
+    damping = 1e-9 * weights.sum().clamp_min(1) * torch.eye(4, dtype=rows.dtype, device=rows.device)
     identity = torch.eye(3, 4, dtype=rows.dtype, device=rows.device)
-    found = torch.linalg.solve(rows @ rows.T + damping, rows @ (wanted * weights).T + damping @ identity.T)
+    found = torch.linalg.solve(weighted @ rows.T + damping, weighted @ wanted.T + damping @ identity.T)
     return found.T.to(image.dtype)

@@ -41,7 +41,7 @@ class Trainer(Protocol):
     gaussians: Gaussians
     count: int
     extent: float
-    last: tuple[Tensor, Tensor] | None
+    last: tuple[Tensor, Tensor, Tensor | None] | None
     dropped: int
     warnings: list[str]
 

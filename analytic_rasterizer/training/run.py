@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Collection, Iterator, Mapping
@@ -267,14 +268,14 @@ class Run:
         if last:
             self.trainer.check()
         shown = self.trainer.last  # which other ranks than the first may lack
-        quality = psnr(*shown).item() if shown else None
+        quality = psnr(*shown).item() if shown else math.nan
         seconds, quality = self.ranks.from_first((self.clock.read(), quality))
         self.trainer.measure(seconds)
         entry = {
             "step": self.progress.step,
             "seconds": round(seconds, 3),
             "loss": mean(losses),
-            "psnr": quality,
+            "psnr": None if math.isnan(quality) else quality,  # where nothing counts there is none
             "gaussians": self.count(),
             "dropped": self.trainer.dropped,
             **({"footprint": self.trainer.footprint} if self.options.first_footprint else {}),
@@ -422,8 +423,7 @@ class Run:
                 background = background_of(self.options, self.capture.background) or self.capture.background
                 memory = self.memory.less(self.trainer.pictures.store.plan, self.device)
                 pictures = self._load(self.capture.test, background, memory)
-                common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
-                common["color_corrected"] = self.options.exposure != "none"
+                common = {"supersampling": self.options.supersampling, "ranks": self.ranks, "color_corrected": True}
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
         metrics["phases"] = self.ranks.from_first(phases)

@@ -16,7 +16,6 @@ from ..density import FixedDensity, GradientDensity, MonteCarloDensity, MonteCar
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
-from ..losses import counted
 from ..render.arguments import camera_arguments
 from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
@@ -138,9 +137,9 @@ class Trainer:
         return len(self.gaussians.means)
 
     @property
-    def last(self) -> tuple[Tensor, Tensor] | None:
-        """Picture and target (`Pictures.target`) of the last step, both black where nothing counts."""
-        return None if self._last is None else counted(*self._last)
+    def last(self) -> tuple[Tensor, Tensor, Tensor | None] | None:
+        """Picture, target (`Pictures.target`) and mask (`Pictures.mask`) of the last step."""
+        return self._last
 
     def step(self) -> None:
         """Takes one step of the optimizer.

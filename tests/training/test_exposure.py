@@ -137,7 +137,7 @@ def test_a_step_has_the_gradients_of_autograd(uneven, tmp_path, options):
 def test_uneven_exposure_is_learned(uneven, tmp_path):
     plain, affine = (run_of(uneven, tmp_path / name, exposure=name) for name in ("none", "affine"))
     without, with_it = plain.evaluate()["test"]["mean"], affine.evaluate()["test"]["mean"]
-    assert "psnr_color_corrected" not in without
+    assert without["psnr_color_corrected"] >= without["psnr"]
     assert with_it["psnr_color_corrected"] > without["psnr"] + 0.3 and with_it["psnr"] > without["psnr"]
     stored = json.loads((tmp_path / "affine" / files.EXPOSURES).read_text())
     gains = [np.diag(np.array(matrix)[:, :3]).mean() for matrix in stored.values()]
