@@ -185,7 +185,8 @@ def _test(job: Job, table: Table, device: str, lpips: Perceptual | None) -> dict
     options = {"supersampling": job.options.supersampling}
     test = evaluate(scene, pictures, job.options.footprint, lpips, **options)
     for of_scale in test.values():
-        of_scale.pop("views", None)
+        for name in ("views", "measured"):
+            of_scale.pop(name, None)
     finest = pictures.settings[min(scales)][0]
     measured = _read(job.folder / METRICS) | {
         "views": len(pictures.views),
