@@ -1,4 +1,5 @@
-// Compiles the loops of kernels_all.h in double, a pixel at a time. dispatch.cpp uses them for tests and gradcheck.
+// Compiles the loops of kernels_all.h in double, a pixel at a time. instruction_sets.cpp uses them for tests and
+// gradcheck.
 #include "cpu/kernels_std.h"
 
 #define AR_ISA double_precision

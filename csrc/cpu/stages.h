@@ -1,5 +1,5 @@
 // Parameters of the CPU's stages beyond core/stages.h, and Stages, the table of functions that run them.
-// backend_cpu.cpp sets the parameters and owns all memory.
+// backend_cpu.cpp sets the parameters and owns all memory. forward.cpp and backward.cpp run what is in the table.
 #pragma once
 
 #include <cstdint>
@@ -31,7 +31,7 @@ template <typename T> struct ProjectParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
   uint8_t* candidates;     ///< [gaussians].
-  int64_t* chunk_offsets;  ///< [chunks + 1] counts, then prefix sums by the caller.
+  int64_t* chunk_offsets;  ///< [chunks + 1] counts, then prefix sums. The last is zero at first.
   int32_t* ids;            ///< [candidates] ascending.
   T* depths;               ///< [candidates].
 };
@@ -180,7 +180,7 @@ template <typename T> struct Stages {
 };
 
 /// Of the best instruction set, or of ANALYTIC_RASTERIZER_ISA. double has the baseline.
-template <typename T> const Stages<T>& stages_of(int footprint);
+template <typename T> const Stages<T>& stages_of(int footprint = 0);
 
 /// Of stages_of<float>.
 const char* instruction_set();
@@ -192,5 +192,30 @@ struct InstructionSet {
 };
 /// The widest first.
 const std::vector<InstructionSet>& instruction_sets();
+
+// forward.cpp.
+
+/// Returns the number of candidates.
+template <typename T> int64_t count_candidates(const ProjectParams<T>& p);
+template <typename T> void project(const ProjectParams<T>& p);
+template <typename T> void project_rows(const ProjectRowsParams<T>& p);
+template <typename T> void shape_rows(const ShapeRowsParams<T>& p);
+/// Returns the number of pairs.
+template <typename T> int64_t count_pairs(BinParams<T>& p);
+template <typename T> void scatter_pairs(BinParams<T>& p);
+template <typename T> void blend(int footprint, const BlendParams<T>& p);
+template <typename T> void inspect(int footprint, const InspectParams<T>& p);
+template <typename T> void weight(int footprint, const WeightParams<T>& p);
+
+// backward.cpp.
+
+template <typename T> void blend_vjp(int footprint, const BlendVjpParams<T>& p);
+template <typename T> void sum_channels(const SumChannelsParams<T>& p);
+template <typename T> void project_vjp(const ProjectVjpParams<T>& p);
+template <typename T> void project_rows_vjp(const ProjectRowsVjpParams<T>& p);
+/// In double, in a fixed order.
+template <typename T> void sum_camera_grads(const CameraGradSums<T>& sums);
+template <typename T> void row_grads(const RowGradsParams<T>& p);
+template <typename T> void weight_vjp(int footprint, const WeightParams<T>& p);
 
 }  // namespace ar::cpu

@@ -88,10 +88,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.threads = thread_count();
     p.candidates = candidates.data();
     p.chunk_offsets = offsets.data();
-    const cpu::CameraStages<T>& stages = stages_of(pass.footprint).of(p.camera);
-    stages.count_candidates(p);
-    int64_t count = 0;
-    for (int64_t& offset : offsets) count += std::exchange(offset, count);
+    const int64_t count = cpu::count_candidates(p);
     SplatTensors out;
     out.splats = make_buffer({count, kSplatWidth}, floats_);
     out.ids = at::empty({count}, ints_);
@@ -99,7 +96,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.splats = pointer<T>(out.splats);
     p.ids = pointer<int32_t>(out.ids);
     p.depths = pointer<T>(out.depths);
-    stages.project(p);
+    cpu::project(p);
     return out;
   }
 
@@ -111,7 +108,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.rules = row_rules_of<T>(rules);
     p.rows = row_outputs_of<T>(rows);
     p.flags = pointer<int32_t>(rows.flags);
-    stages_of(pass.footprint).of(p.camera).project_rows(p);
+    cpu::project_rows(p);
   }
 
   void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
@@ -119,7 +116,7 @@ template <typename T> class CpuBackend final : public Backend {
     set_projection<T>(p, in, pass);
     p.threads = thread_count();
     p.packed = packed_rows_of<T>(packed);
-    if (p.packed.rows) stages_of(pass.footprint).of(p.camera).project_rows(p);
+    if (p.packed.rows) cpu::project_rows(p);
   }
 
   SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) override {
@@ -131,7 +128,7 @@ template <typename T> class CpuBackend final : public Backend {
     cpu::ShapeRowsParams<T> p = {};
     set_shape_rows<T>(p, rows, pass, out.splats);
     p.threads = thread_count();
-    stages_of(pass.footprint).shape_rows(p);
+    cpu::shape_rows(p);
     return out;
   }
 
@@ -140,7 +137,6 @@ template <typename T> class CpuBackend final : public Backend {
     // If there is no memory for the image, raise before tiles are numbered.
     if (grid.tiles() > kManyTiles) at::empty({grid.height, grid.width}, floats_);
     const int64_t n = splats.ids.size(0);
-    const cpu::Stages<T>& stages = stages_of(pass.footprint);
     ListTensors out;
     out.splats = splats.splats;
     out.ids = splats.ids;
@@ -155,13 +151,12 @@ template <typename T> class CpuBackend final : public Backend {
     p.threads = thread_count();
     p.tile_offsets = pointer<int64_t>(out.tile_offsets);
     p.splat_offsets = pointer<int64_t>(out.splat_offsets);
-    stages.count_pairs(p);
-    const int64_t pairs = p.tile_offsets[grid.tiles()];
+    const int64_t pairs = cpu::count_pairs(p);
     out.pairs = make_buffer({pairs}, ints_);
     out.positions = make_buffer({pass.keep ? pairs : 0}, longs_);
     p.pairs = pointer<int32_t>(out.pairs);
     p.positions = pointer<int64_t>(out.positions);
-    stages.scatter_pairs(p);
+    cpu::scatter_pairs(p);
     out.counts = at::empty({0}, longs_);
     return out;
   }
@@ -177,7 +172,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.threads = thread_count();
     const Tensor scratch = make_scratch(p.threads, channels.count);
     p.scratch = pointer<T>(scratch);
-    stages_of(pass.footprint).blend(p);
+    cpu::blend(pass.footprint.choice.index, p);
   }
 
   void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs*,
@@ -187,7 +182,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.ids = const_pointer<int32_t>(lists.ids);
     p.lists = tile_lists_of(lists);
     p.threads = thread_count();
-    stages_of(pass.footprint).inspect(p);
+    cpu::inspect(pass.footprint.choice.index, p);
   }
 
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
@@ -208,14 +203,14 @@ template <typename T> class CpuBackend final : public Backend {
     p.pair_stride = out.pairs.size(1);
     p.mean_sums = mean_sums;
     p.pair_means = pointer<Vec2<T>>(out.means);
-    const cpu::Stages<T>& stages = stages_of(pass.footprint);
-    const Tensor replay = at::empty({stages.moves ? p.threads : 0, cpu::kReplayNumbers}, floats_);
+    const int footprint = pass.footprint.choice.index;
+    const Tensor replay = at::empty({pass.footprint.moves ? p.threads : 0, cpu::kReplayNumbers}, floats_);
     p.replay = pointer<T>(replay);
     if (own) {
       p.count = 3;
       p.channel_sums = pairs ? p.pair_grads + cpu::kPairNumbers : nullptr;
       p.channel_stride = p.pair_stride;
-      stages.blend_vjp(p);
+      cpu::blend_vjp(footprint, p);
       return out;
     }
     out.dL_dchannels = make_zeros_like(channels.rows);
@@ -233,8 +228,8 @@ template <typename T> class CpuBackend final : public Backend {
     for (int first = 0; first < count; first += cpu::kWindow) {
       p.first = sum.first = first;
       p.count = sum.count = std::min(int(count) - first, cpu::kWindow);
-      stages.blend_vjp(p);
-      stages.sum_channels(sum);
+      cpu::blend_vjp(footprint, p);
+      cpu::sum_channels(sum);
       p.pair_grads = nullptr;
     }
     return out;
@@ -249,7 +244,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.pair_colors = sums.pairs.size(1) > cpu::kPairNumbers;
     set_pair_sums(p, lists, sums);
     const Tensor camera_grads = make_camera_grads(p, grads);
-    stages_of(pass.footprint).of(p.camera).project_vjp(p);
+    cpu::project_vjp(p);
     return camera_grads;
   }
 
@@ -260,20 +255,12 @@ template <typename T> class CpuBackend final : public Backend {
     p.add = grads.add;
     p.threads = thread_count();
     const Tensor camera_grads = make_camera_grads(p, grads);
-    cpu::stages_of<T>(0).of(p.camera).project_rows_vjp(p);  // The same for every footprint.
+    cpu::project_rows_vjp(p);
     return camera_grads;
   }
 
   void sum_camera_grads(const Tensor& parts, const Grads& grads) override {
-    const CameraGradSums<T> sums = camera_sums_of<T>(parts, grads);
-    for (int k = 0; k < kCameraNumbers; ++k) {
-      const CameraNumber<T> number = camera_number(sums, k);
-      if (!number.to) continue;
-      double sum = 0;
-      for (int64_t i = 0; number.column >= 0 && i < sums.n; ++i)
-        sum += double(sums.parts[i * kCameraGradWidth + number.column]);
-      *number.to = T(sum);
-    }
+    cpu::sum_camera_grads(camera_sums_of<T>(parts, grads));
   }
 
   void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
@@ -281,15 +268,15 @@ template <typename T> class CpuBackend final : public Backend {
     cpu::RowGradsParams<T> p = {};
     set_row_grads<T>(p, rows, pass, dL_drows);
     set_pair_sums(p, lists, sums);
-    stages_of(pass.footprint).row_grads(p);
+    cpu::row_grads(p);
   }
 
   void weight(const WeightTensors& tensors, const FootprintSpec& footprint) override {
     cpu::WeightParams<T> p = {};
     set_weight<T>(p, tensors, footprint);
     p.threads = thread_count();
-    const cpu::Stages<T>& stages = stages_of(footprint);
-    (tensors.dL_dweight.defined() ? stages.weight_vjp : stages.weight)(p);
+    const int index = footprint.choice.index;
+    tensors.dL_dweight.defined() ? cpu::weight_vjp(index, p) : cpu::weight(index, p);
   }
 
   double lap() override {
@@ -299,10 +286,6 @@ template <typename T> class CpuBackend final : public Backend {
 
  private:
   using Clock = std::chrono::steady_clock;
-
-  static const cpu::Stages<T>& stages_of(const FootprintSpec& footprint) {
-    return cpu::stages_of<T>(footprint.choice.index);
-  }
 
   /// For project_vjp and row_grads.
   template <class Params> static void set_pair_sums(Params& p, const ListTensors& lists, const PairSums& sums) {

@@ -1,5 +1,5 @@
 // Chooses the instruction set, once per process, and fills tables of stages (stages.h) with functions of kernels_*.cpp.
-// csrc/torch/backend_cpu.cpp calls stages_of() for a table.
+// forward.cpp and backward.cpp call stages_of() for a table.
 #include <cstdlib>
 #include <cstring>
 #include <vector>
