@@ -7,8 +7,8 @@
 
 namespace ar {
 
-template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
-  if constexpr (Out::kAdd) {
+template <class Out, class V> AR_HD void put(const Out& out, V& to, V gradient) {
+  if (out.adds()) {
     to = to + gradient;
   } else {
     to = gradient;

@@ -190,9 +190,9 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   AR_UNROLL for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
     AR_UNROLL for (int k = 0; k < kCount; ++k) {
-      if (k < used) dL_dsh[k] = Out::kAddShs ? dL_dsh[k] + basis[k] * free : basis[k] * free;
+      if (k < used) dL_dsh[k] = out.adds_shs() ? dL_dsh[k] + basis[k] * free : basis[k] * free;
     }
-    for (int k = used; k < g.sh_stride && !Out::kAddShs; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
+    for (int k = used; k < g.sh_stride && !out.adds_shs(); ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
   const Vec3<T> dL_dunit = sh_basis_vjp<Cam::kShDegree>(g.sh_degree, d.unit, weight);
@@ -325,8 +325,8 @@ template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, in
 template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
-  if constexpr (Out::kAdd) {
-    for (int k = 0; dL_dsh && !Out::kAddShs && k < g.sh_stride; ++k) dL_dsh[k] = zero;
+  if (out.adds()) {
+    for (int k = 0; dL_dsh && !out.adds_shs() && k < g.sh_stride; ++k) dL_dsh[k] = zero;
     return;
   }
   if (out.means) out.means[i] = zero;

@@ -90,7 +90,8 @@ enum class MeanSums : int32_t {
 /// Gradients by the members of Gaussians; null: not wanted.
 template <typename T> struct GaussianGrads {
   /// Whether gradients are added, also to the `dL_dsh` of project_vjp.
-  static constexpr bool kAdd = false, kAddShs = false;
+  AR_HD static constexpr bool adds() { return false; }
+  AR_HD static constexpr bool adds_shs() { return false; }
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
@@ -101,11 +102,6 @@ template <typename T> struct GaussianGrads {
   T* means2d;          ///< [n, means2d_stride] per (0.5 W, 0.5 H) px, as in 3DGS
   int means2d_stride;  ///< 3: column 2 is the total of the two sums; 4: they are columns 2 and 3
   MeanSums mean_sums;
-};
-
-/// Gradients that are added to others; without means2d.
-template <typename T> struct AddedGrads : GaussianGrads<T> {
-  static constexpr bool kAdd = true, kAddShs = true;
 };
 
 template <class Element> struct Column {

@@ -92,8 +92,36 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
 /// Pairs from prefetch to use. Those of a splat are in many tiles.
 inline constexpr int64_t kPairsAhead = 16;
 
+/// The gradient of a splat: of the sums of its pairs, or else of a public row.
+template <typename T> struct SplatGradOf {
+  FootprintChoice footprint;
+  const PairGrad<T>* sums;
+  const ProjectedRowGrads<T>* rows;
+  int64_t row;
+
+  AR_HD ProjectedGrad<T> operator()(const Cov2d<T>& cov, T opacity) const {
+    return sums ? projected_grad(footprint, cov, *sums) : projected_grad(*rows, row, opacity);
+  }
+};
+
+template <typename T> struct GradsOrSums : GaussianGrads<T> {
+  bool add;
+  AR_HD bool adds() const { return add; }
+  AR_HD bool adds_shs() const { return add; }
+};
+
+/// One copy for every kind of gradient: with a full camera it is a third of a megabyte, and takes ten seconds to
+/// compile.
+template <class Cam, typename T>
+AR_ONE_COPY void gaussian_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const SplatGradOf<T>& grad_of,
+                              const RowShownGrad<T>& shown, const GradsOrSums<T>& out, CameraGrad<T>* camera_grad) {
+  ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
+                  coefficients_of(out.shs, g.sh_stride, i), out, camera_grad);
+}
+
 template <template <typename> class Cam, typename T> void project_vjp(const cpu::ProjectVjpParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
+  const GradsOrSums<T> out = {p.grads, false};
   for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     const int64_t pairs = p.pairs.splat_offsets[p.pairs.splats];
@@ -107,7 +135,7 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
         continue;
       }
       PairGrad<T> sums = {};
-      ShownGrad<T> shown = {};
+      RowShownGrad<T> shown = {{}, T(0), DepthKind::kOfModel, DepthKind::kNone};
       Vec2<T> mean_sums = {};
       for (int64_t k = first; k < last; ++k) {
         if (k + kPairsAhead < pairs)
@@ -119,18 +147,16 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
         if (p.pair_means) mean_sums = mean_sums + p.pair_means[pair];
       }
       if (p.dL_dchannels.data) add_channels_vjp(p.dL_dchannels, i, depth_of(camera, g.means[i]), shown);
-      const auto grad_of = [&](const Cov2d<T>& cov, T) { return projected_grad(p.footprint, cov, sums); };
-      ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
-                      coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
-                      p.camera_grads ? &p.camera_grads[chunk] : nullptr);
+      gaussian_vjp(camera, g, i, {p.footprint, &sums, nullptr, 0}, shown, out,
+                   p.camera_grads ? &p.camera_grads[chunk] : nullptr);
       write_mean_sums(p.grads, i, camera.size, mean_sums);
     }
   });
 }
 
-template <template <typename> class Cam, typename T, class Out>
-void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p, const Out& out) {
+template <template <typename> class Cam, typename T> void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
+  const GradsOrSums<T> out = {p.grads, p.add};
   for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
@@ -139,18 +165,10 @@ void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p, const Out& out) {
         zero_grads(g, i, out);
         continue;
       }
-      const auto grad_of = [&](const Cov2d<T>&, T opacity) { return projected_grad(p.rows, row, opacity); };
-      ar::project_vjp(camera, g, i, grad_of, shown_grad(p.rows, row), coefficients_of(g.shs, g.sh_stride, i),
-                      coefficients_of(out.shs, g.sh_stride, i), out, p.camera_grads ? &p.camera_grads[chunk] : nullptr);
+      gaussian_vjp(camera, g, i, {{}, nullptr, &p.rows, row}, shown_grad(p.rows, row), out,
+                   p.camera_grads ? &p.camera_grads[chunk] : nullptr);
     }
   });
-}
-template <template <typename> class Cam, typename T> void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p) {
-  if (p.add) {
-    project_rows_vjp<Cam>(p, AddedGrads<T>{p.grads});
-  } else {
-    project_rows_vjp<Cam>(p, p.grads);
-  }
 }
 
 }  // namespace ar::AR_ISA

@@ -166,10 +166,11 @@ struct FromRows {
   }
 };
 
-/// Coefficients go by way of shared memory.
-struct StagedGrads : AddedGrads<float> {
-  static constexpr bool kAddShs = false;
-  __device__ StagedGrads(const GaussianGrads<float>& grads) : AddedGrads<float>{grads} {}
+/// Adds; coefficients go by way of shared memory.
+struct StagedGrads : GaussianGrads<float> {
+  AR_HD static constexpr bool adds() { return true; }
+  AR_HD static constexpr bool adds_shs() { return false; }
+  __device__ StagedGrads(const GaussianGrads<float>& grads) : GaussianGrads<float>(grads) {}
 };
 
 /// A thread per Gaussian. From: FromPairs or FromRows. Out: GaussianGrads<float>, or StagedGrads with FromRows.
@@ -194,7 +195,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads,
   const int n = rows_of_group(first, params.gaussians.n);
   float* camera_grads = params.camera_grads ? params.camera_grads + first / kGradRows * kCameraGradWidth : nullptr;
   if (lit == 0) {
-    if (!Out::kAdd && !From::kZeroed) zero_grads_of_warp(params.gaussians, out, first, n);
+    if (!Out::adds() && !From::kZeroed) zero_grads_of_warp(params.gaussians, out, first, n);
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
@@ -221,7 +222,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads,
     zero_grads(g, i, out, dL_dsh);
   }
   const int stride = params.gaussians.sh_stride;
-  if (out.shs) rows.template store<Out::kAdd>(out.shs + first * stride, stride, n);
+  if (out.shs) rows.template store<Out::adds()>(out.shs + first * stride, stride, n);
   if (!Cam::kFull || !camera_grads) return;
   const float* values = &camera_grad.view_x.x;
   AR_UNROLL for (int k = 0; k < kCameraGradWidth; ++k) {
