@@ -81,7 +81,7 @@ test-simple-knn: $(VENV)/.installed
 BROWSER_TESTS ?= tests/viewer
 BROWSER_PACKAGES := chromium firefox-esr xvfb libgl1-mesa-dri libegl1 libgl1
 test-browser: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable ".[test,test-browser]" || echo "no playwright: going on without"
+	$(BIN)/python wheels/install.py --editable ".[test,test-browser]" || echo "no playwright: going on without"
 	@if command -v apt-get > /dev/null && [ "$$(id -u)" = 0 ] && \
 	  ! (command -v chromium && command -v firefox-esr && command -v Xvfb) > /dev/null; then \
 	  apt-get update -qq && apt-get install -y -qq --no-install-recommends $(BROWSER_PACKAGES) > /dev/null || \
@@ -162,7 +162,7 @@ $(VENV)/.torch: $(VENV)/.venv
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.torch $(SOURCES)
-	$(BIN)/python -m pip install --quiet --editable ".[test]"
+	$(BIN)/python wheels/install.py --editable ".[test]"
 	touch $@
 
 clean:

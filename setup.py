@@ -8,6 +8,7 @@ ANALYTIC_RASTERIZER_SANITIZE=1 builds the CPU path under AddressSanitizer and Un
 `make test-python-sanitized`: Python must be started with the sanitizer's library preloaded.
 """
 
+import contextlib
 import os
 import re
 import shlex
@@ -15,6 +16,8 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 from setuptools import setup
@@ -157,11 +160,37 @@ def openmp_flags() -> tuple[list[str], list[str]]:
             if all(succeeds([*shlex.split(name), *command]) for command in commands):
                 return ["-fopenmp"], library
     print(
-        f"analytic_rasterizer: {name} has no OpenMP, so the CPU path will run on one thread. Set CXX to one that has it: "
-        "g++, or clang++ with libomp.",
+        f"analytic_rasterizer: {name} has no OpenMP, so the CPU path will run on one thread. Set CXX to one with "
+        "OpenMP: g++, or clang++ with libomp.",
         file=sys.stderr,
     )
     return [], []
+
+
+@contextlib.contextmanager
+def short_progress() -> Iterator[None]:
+    """Of the commands that ninja prints, to this process's output, only "[3/14] csrc/cpu/kernels_avx2.cpp" is left."""
+    sys.stdout.flush()
+    output, (reader, writer) = os.dup(1), os.pipe()
+    os.dup2(writer, 1)
+    os.close(writer)
+
+    def pass_on() -> None:
+        with open(reader, errors="replace") as lines:
+            for line in lines:
+                done = re.match(r"(\[\d+/\d+\]) .* -c (\S+) -o ", line)
+                short = f"{done[1]} {os.path.relpath(done[2], ROOT)}\n" if done else line
+                os.write(output, short.encode(errors="replace"))
+
+    thread = threading.Thread(target=pass_on)
+    thread.start()
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(output, 1)  # The last end of the pipe: the thread has read all.
+        thread.join()
+        os.close(output)
 
 
 class Build(BuildExtension):
@@ -181,7 +210,8 @@ class Build(BuildExtension):
             extension.extra_link_args += link_args
             extension.depends += extension.sources  # a change of any is looked at, without ninja too
             extension.sources = in_units(extension.sources, Path(self.build_temp) / "units")
-        super().build_extensions()
+        with short_progress():
+            super().build_extensions()
 
 
 README, LINKS = description_and_links()

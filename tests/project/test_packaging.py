@@ -124,3 +124,31 @@ def changelog():
 @pytest.mark.parametrize("version", changelog())
 def test_a_version_of_the_changelog_is_short(version):
     assert len(changelog()[version]) <= 40
+
+
+BUILDING = """
+import os, runpy, subprocess, sys, setuptools
+setuptools.setup = lambda **_: None
+setup = runpy.run_path("setup.py")
+print("before", flush=True)
+with setup["short_progress"]():
+    print("[1/2] ccache c++ -MMD -c -c", os.path.abspath("csrc/cpu/sort.cpp"), "-o sort.o -O3")
+    print("sort.cpp:3: warning")
+    subprocess.run([sys.executable, "-c", "print('[2/2] c++ -c csrc/cpu/ssim.cpp -o ssim.o')"])
+print("after", flush=True)
+print(setup["openmp_flags"]()[0], flush=True)
+os.environ["CXX"] = "no-such-compiler"
+print(setup["openmp_flags"](), flush=True)
+"""
+
+
+def test_a_build_says_what_it_compiles_and_that_there_is_no_openmp():
+    environment = os.environ | {"ANALYTIC_RASTERIZER_CUDA": "0"}
+    environment.pop("CXX", None)
+    command = [sys.executable, "-c", BUILDING]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+    *progress, flags, without = done.stdout.splitlines()
+    assert progress == ["before", "[1/2] csrc/cpu/sort.cpp", "sort.cpp:3: warning", "[2/2] csrc/cpu/ssim.cpp", "after"]
+    assert flags == ("['-fopenmp']" if ar._C.has_openmp else "[]") and without == "([], [])"
+    assert "no-such-compiler has no OpenMP, so the CPU path will run on one thread" in done.stderr

@@ -23,7 +23,7 @@ def module_of(name):
     return module
 
 
-index, platform_tag = module_of("index"), module_of("platform_tag")
+index, installing, platform_tag = (module_of(name) for name in ("index", "install", "platform_tag"))
 # pip of a user without settings: what it finds, it finds in the index and in its environment.
 PIP = {key: value for key, value in os.environ.items() if not key.startswith(("PIP_", "PYTHONPATH"))}
 PIP["PIP_CONFIG_FILE"] = os.devnull
@@ -186,3 +186,12 @@ def test_the_workflow_builds_what_its_folders_say():
         assert folder == wheel_folder(version, f"{major}.{minor}" if major else None)
         assert cuda == ("1" if major else "0")
     assert f"pair: [{', '.join(sorted(row[0] for row in rows))}]" in text
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_an_installation_says_what_it_compiles_and_why_it_fails(capsys, status):
+    lines = ["Collecting x", "  [3/14] csrc/cpu/sort.cpp", "  analytic_rasterizer: c++ has no OpenMP", "[notice] pip"]
+    program = f"import sys; print(*{lines}, sep='\\n'); sys.exit({status})"
+    assert installing.run([sys.executable, "-c", program]) == status
+    shown = ["[3/14] csrc/cpu/sort.cpp", "analytic_rasterizer: c++ has no OpenMP"]
+    assert capsys.readouterr().out.splitlines() == shown + (lines if status else [])
