@@ -1,7 +1,7 @@
-"""Fake kernels of the operators: shapes and dtypes of what they return, for tracing (torch.compile, torch.export).
+"""How Python calls the operators (`Op`), and their fake kernels: shapes and dtypes for torch.compile and torch.export.
 
-The operators' schemas, kernels and gradients are in csrc/torch. Names, their order, and widths of rows are read from
-there: from the schemas and from `_C`.
+Schemas, kernels and gradients are in csrc/torch. Names, their order, and widths of rows are read from the schemas and
+from `_C`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The photographs that a training saw, for its views."""
+"""The photographs that a scene was trained with, as PNG, for `view`: its page compares them with the rendering."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands that show a scene share: they find it and its views, and say what was chosen and why."""
+"""For commands that show a scene: finds its views and its background, and says on stderr what was chosen and why."""
 
 from __future__ import annotations
 

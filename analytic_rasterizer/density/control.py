@@ -1,4 +1,7 @@
-"""What all kinds of density control have in common."""
+"""`FixedDensity`, the density control that changes nothing, and the base of the others.
+
+It holds what all share: it replaces rows of the Gaussians, of the optimizer's state and of further tensors.
+"""
 
 from __future__ import annotations
 

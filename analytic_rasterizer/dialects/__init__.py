@@ -1,6 +1,7 @@
 """The dialects of diff_gaussian_rasterization: how each repository calls its rasterizer, and what it unpacks.
 
-A dialect is a file of this package, and its name is the file's. Adding one: docs/internals/adding-a-dialect.md.
+A dialect is a file of this package, and its name is the file's. `set_dialect` or the environment variable
+ANALYTIC_RASTERIZER_DIALECT chooses one for the process. Adding one: docs/internals/adding-a-dialect.md.
 `gsplat` is no dialect but another interface, which takes cameras in batches.
 """
 

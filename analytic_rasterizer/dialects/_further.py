@@ -1,4 +1,4 @@
-"""What the rasterizers of dialects take beside the arguments of 3DGS 2023: where it stands, and features to blend."""
+"""For dialects whose `forward` has more arguments than in 3DGS 2023: its signature, and features that are blended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rows of splats on their way between ranks, and their gradients on the way back."""
+"""Sends splats of one camera to the ranks that blend its bands, and their gradients back: for `rasterize_bands`.
+
+`Route`, which says which rows go where, serves rows.py too.
+"""
 
 from __future__ import annotations
 

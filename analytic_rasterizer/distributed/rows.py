@@ -1,7 +1,8 @@
-"""The cameras of a step: rows of splats from the ranks of their Gaussians to those of the cameras, and back.
+"""A step of `rasterize` on one rank: projects its Gaussians, sends splats to the ranks of the cameras, and blends.
 
-A row is a splat in one piece (PackedRow in csrc/core/stages.h). Rows are written where they are sent from and blended
-where they arrive, and so are their gradients. With one camera per rank they are not copied in between.
+The gradients go back the same way. A row is a splat in one piece (PackedRow in csrc/core/stages.h). Rows are written
+where they are sent from and blended where they arrive, and so are their gradients. With one camera per rank they are
+not copied in between.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The size of a capture: what the learning rate of the means and the limits of size are measured in.
 
-[3DGS] takes the radius of the cameras for it. That fits cameras around an object, which are as far from each other as
-from what they see. Those of a tripod are all at one place, and a camera with a wrong pose may be anywhere.
+Also cameras that are too far away to be right. [3DGS] takes the radius of the cameras for the size. That fits cameras
+around an object, which are as far from each other as from what they see. Those of a tripod are all at one place, and a
+camera with a wrong pose may be anywhere.
 """
 
 from __future__ import annotations

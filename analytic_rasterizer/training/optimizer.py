@@ -1,4 +1,4 @@
-"""The optimizer of a training: `FusedAdam`, without the compiler of torch."""
+"""`FusedAdam` for trainings: its first step does not import torch's compiler, which would take seconds."""
 
 from __future__ import annotations
 

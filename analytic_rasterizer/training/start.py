@@ -1,4 +1,7 @@
-"""What a training starts from: pictures and points, or a checkpoint, with its options or another length."""
+"""What a training starts from: Gaussians from a scene, from points or at random places; and the background.
+
+Also the options of a checkpoint that goes on to another length.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options that change nothing beside the others: whoever chose one expects something of it."""
+"""Options that change nothing beside the others: a training raises ValueError if one was chosen, and says why."""
 
 from __future__ import annotations
 

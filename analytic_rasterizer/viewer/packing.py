@@ -1,4 +1,7 @@
-"""A scene in the form that the page reads: one JSON object and two arrays of numbers."""
+"""A scene in the form that the page reads: one JSON object and two arrays of numbers.
+
+Also which footprints the page can draw, and the camera with which it begins where a scene has no views.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-// From the parameters that a training optimises to the rasterizer's: exp of scales, unit quaternions, sigmoid of
-// opacities; and the 3D filter that widens Gaussians. The adjoints compute the values again.
+// The activations of 3DGS for one Gaussian: exp of scales, unit quaternions, sigmoid of opacities. Also their penalty,
+// a regulariser of the loss, and the 3D filter. The adjoints compute the values again.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// A step of Adam [Kingma and Ba 2015, Algorithm 1] for several tensors. Epsilon is outside the root, as in
-// torch.optim.Adam.
+// A step of Adam [Kingma and Ba 2015, Algorithm 1] for one number, and how the numbers of several tensors are divided
+// among threads. As in torch.optim.Adam epsilon is outside the root.
 #pragma once
 
 #include <cmath>

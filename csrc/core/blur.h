@@ -1,5 +1,5 @@
 // Adds the Blur of lens and shutter to a projected covariance, and lowers the amplitude so that the splat keeps its
-// mass.
+// mass. And the adjoint.
 #pragma once
 
 #include "core/covariance.h"

@@ -1,6 +1,6 @@
-// One Gaussian to one splat, and the adjoint. The camera gives mean, covariance, opacity and depth (project_gaussian),
-// the footprint shape and support (shape_splat), the harmonics colour (splat_color). project_vjp is the adjoint of all
-// three. may_be_visible culls cheaply before them. Public rows and rows of channels are here too.
+// Projects one Gaussian to one splat, for every backend: project_gaussian makes mean, covariance, opacity and depth,
+// shape_splat shape and support, splat_color the colour. project_vjp is the adjoint of all three. may_be_visible culls
+// cheaply first. write_packed writes the row for another rank.
 #pragma once
 
 #include <type_traits>

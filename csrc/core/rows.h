@@ -1,5 +1,5 @@
-// The rows of the public stages: which Gaussians have one (measure_row), what is written of them (write_row_or_flag),
-// and the adjoint of its depths.
+// The rows that the op `project` returns to Python, one for each visible Gaussian: which Gaussians are visible
+// (measure_row), what a row holds (write_row), and the gradient of a row.
 #pragma once
 
 #include "core/project.h"

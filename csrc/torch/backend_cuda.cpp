@@ -1,6 +1,5 @@
-// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. The host waits for the device
-// in tiles_share_lists() and lap(), with debug, and for the count of pairs where counting_of() or pair_guess.h asks for
-// it.
+// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. The host waits only to count
+// pairs (counting_of(), pair_guess.h), to time stages, for tiles_share_lists(), and with debug.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>

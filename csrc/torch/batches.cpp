@@ -1,4 +1,5 @@
-// checks.h for arguments with several cameras, and with batches of Gaussians.
+// Arguments of ops with several cameras, or batches of Gaussians: check_cameras() checks them, inputs_of() returns
+// those of one camera.
 #include <string>
 #include <type_traits>
 

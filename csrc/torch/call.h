@@ -1,4 +1,4 @@
-// The class Call of _C, by which render/rasterizer.py and training/trainer.py call ops (call.cpp). ops.cpp adds it.
+// The class Call of _C, by which Python calls ops (ops.py; call.cpp). ops.cpp adds it.
 #pragma once
 
 #include <pybind11/pybind11.h>

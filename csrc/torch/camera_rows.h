@@ -1,4 +1,4 @@
-// Of tensors with rows of several cameras, those of one.
+// Rows of splats lie camera after camera: selects the rows of one camera, for ops with several.
 #pragma once
 
 #include "torch/backend.h"

@@ -1,4 +1,4 @@
-// scene_grads.h. Those of the camera are summed here, from parts that a backend returns.
+// scene_grads.h. A backend returns the camera's gradient in parts, which are summed here.
 #include "torch/scene_grads.h"
 
 #include <ATen/ops/aminmax.h>

@@ -1,4 +1,4 @@
-// The arguments of the ops of a training step besides rendering, as arguments.h has those of the others.
+// The arguments of training.cpp's and picture.cpp's ops, a struct per op as in arguments.h.
 #pragma once
 
 #include "torch/arguments.h"

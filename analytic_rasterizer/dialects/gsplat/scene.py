@@ -1,5 +1,7 @@
-"""What the two operators of gsplat's `rasterization` are given: `project`, Gaussians and cameras to rows, and
-`composite`, rows to images (csrc/torch/)."""
+"""gsplat's `rasterization` by two operators (csrc/torch/): prepares their arguments, and calls them.
+
+`Scene.project` makes rows of splats from Gaussians and cameras, `composite` makes images from rows.
+"""
 
 from __future__ import annotations
 

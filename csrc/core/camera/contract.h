@@ -1,6 +1,6 @@
-// The contract of a camera model: the map from the world to pixels, its Jacobian, and the adjoints of both. A model is
-// a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
-// and defocus.h call it. pinhole.h shows the arguments.
+// The types Camera, FullCamera and CameraGrad, and the contract of a camera model: the map from the world to pixels,
+// its Jacobian, and the adjoints of both. A model is a struct of static functions in its own header, and an entry of
+// the list in models.h. Only core/camera.h, motion.h and defocus.h call it. pinhole.h shows the arguments.
 //
 // `camera` is a Camera or a FullCamera, `mean` a point of the world, `view` the same point in camera space, p a
 // ProjectedMean. Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.

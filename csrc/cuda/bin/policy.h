@@ -1,4 +1,4 @@
-// Numbers chosen by measuring, with what they trade.
+// Launch shapes and lengths of loops in the kernels of bin/, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {

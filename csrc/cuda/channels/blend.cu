@@ -1,8 +1,7 @@
 // Launches blend_groups (groups.cuh): the forward pass for any number of channels, in groups of 32 or 8.
 //
-// Tried and lost (H200, plant hd, `box` 1, 8 channels; docs/internals/log.md, "More than four channels"): backward,
-// batches of 32 splats (1214 instead of 930 us) or 128 (1495 us) for 64; a warp per splat in sum_channels, which took
-// as long for 8 channels as for 32; and lists cut into segments, 65 kernels without a gain ("Features that are gone").
+// Tried and lost (docs/internals/log.md, "More than four channels" and "Features that are gone"): backward, batches of
+// 32 or 128 splats; a warp per splat in sum_channels; lists cut into segments.
 #include "cuda/channels/groups.cuh"
 
 namespace ar::cuda {

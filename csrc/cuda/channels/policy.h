@@ -1,4 +1,4 @@
-// Numbers chosen by measuring, with what they trade.
+// Batches and resident blocks of the kernels of channels/, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {

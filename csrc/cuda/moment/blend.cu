@@ -1,10 +1,8 @@
 // Launches the forward pass of footprints whose samples move. Where lists are cut into segments (cut_lists.h), filter
 // runs once. Then, for each group of channels, listed_blend takes the lists that are cut, and moving_blend the others.
 //
-// Tried and lost (docs/internals/log.md, the sections "moment/" and "The queue"): eight lanes per pixel in large images
-// (2 times as slow); a queue in all lists with 4 samples (H100, plaza lo, with backward 2.363 -> 2.458 ms); backward, a
-// warp per tile as in still/ (1 sample 1.656 -> 2.375 ms) and whole lists as one segment (16 samples 9.755 -> 10.74
-// ms).
+// Tried and lost (docs/internals/log.md, the sections "moment/" and "The queue"): eight lanes per pixel in large
+// images; a queue in all lists with 4 samples; backward, a warp per tile as in still/, and whole lists as one segment.
 #include "cuda/dispatch.h"
 #include "cuda/moment/listed.cuh"
 #include "cuda/moment/walk.cuh"

@@ -1,4 +1,4 @@
-// Numbers chosen by measuring, with what they trade.
+// When moment/ cuts lists, how long segments are, and launch shapes, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {

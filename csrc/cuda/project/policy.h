@@ -1,4 +1,4 @@
-// Numbers chosen by measuring, with what they trade.
+// Launch shapes of the kernels of project/, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {

@@ -1,10 +1,8 @@
 // Launches blend_front and the tail (front.cuh, tail.cuh): the forward pass of footprints whose samples stay, for up to
 // four channels.
 //
-// Tried and lost (H200; docs/internals/log.md, "still/, forward" and "still/, backward"): two pixels in a lane (plant
-// hd, `analytic` 402 -> 465 us), lists of half warps (`box` 4 576 -> 622 us); backward, chunks of 128 pairs (plaza lo,
-// with forward 1.105 -> 1.157 ms) and two subtiles at a time for `cumulant` and `analytic` (655 -> 724, 937 -> 1118
-// us).
+// Tried and lost (docs/internals/log.md, "still/, forward" and "still/, backward"): two pixels in a lane; lists of half
+// warps; backward, chunks of 128 pairs, and two subtiles at a time for `cumulant` and `analytic`.
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"
 #include "cuda/still/tail.cuh"

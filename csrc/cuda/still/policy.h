@@ -1,4 +1,4 @@
-// Numbers chosen by measuring, with what they trade.
+// Length of the front and launch shapes of the kernels of still/, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {
