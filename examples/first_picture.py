@@ -1,9 +1,7 @@
 """The smallest program: three Gaussians, one camera, one picture, one gradient step. Runs on the CPU in a second.
 
-Writes first_picture.png to the current folder; first_picture.ppm where Pillow is not installed.
+Writes first_picture.png to the current folder.
 """
-
-import importlib.util
 
 import torch
 
@@ -25,11 +23,5 @@ assert color.shape == (3, 240, 320) and color.isfinite().all() and means.grad.is
 print(f"analytic_rasterizer {ar.__version__}: {ar.instruction_set()}, CUDA {'yes' if ar._C.has_cuda else 'no'}")
 print(f"the picture spans [{color.min():.3f}, {color.max():.3f}], the radii are {radii.tolist()} px")
 
-if importlib.util.find_spec("PIL"):
-    file = "first_picture.png"
-    io.save_image(file, color)
-else:
-    file = "first_picture.ppm"
-    pixels = (255 * color.detach().clamp(0, 1)).round().byte().permute(1, 2, 0)
-    io.write_bytes(file, b"P6 320 240 255\n" + pixels.contiguous().numpy().tobytes())
-print(f"see {file}")
+io.save_image("first_picture.png", color)
+print("see first_picture.png")

@@ -3,7 +3,8 @@
     python examples/train_loop.py OUT [FOLDER]
 
 trains on the capture in FOLDER (NeRF-synthetic, COLMAP or nerfstudio), or on pictures that it makes itself, writes
-OUT/scene.ply and prints the PSNR of the training pictures. Runs on CUDA where there is a device, otherwise on the CPU.
+OUT/scene.ply, which says for which footprint it is, and prints the PSNR of the training pictures. Runs on CUDA where
+there is a device, otherwise on the CPU.
 Needs `pip install ".[train]"`.
 """
 
@@ -74,7 +75,7 @@ def main(out, folder=None):
         steps, options = 7000, ar.density.GradientOptions(max_gaussians=500_000)
     gaussians, losses = train(pictures, points, steps, options)
     Path(out).mkdir(parents=True, exist_ok=True)
-    io.save_scene(Path(out) / "scene.ply", gaussians)
+    io.save_scene(Path(out) / "scene.ply", gaussians, io.SceneMetadata(footprint=FOOTPRINT))
     psnr = training.evaluate(gaussians, pictures, FOOTPRINT)["mean"]["psnr"]
     print(f"{gaussians.count} Gaussians, loss {losses[0]:.3f} to {losses[-1]:.3f}, PSNR {psnr:.2f} dB")
 

@@ -19,6 +19,11 @@ from ..render.settings import GaussianRasterizationSettings
 
 LIMIT = 0.3  # of `affine_error`: there a weight is off by 0.1 to 0.3 at most
 _ROWS = 2**18  # that are computed at a time
+# A Gaussian whose largest standard deviation is W depths has, with a pinhole, an error of at most sqrt(5 / 2) W /
+# (1 - W)^2, below LIMIT for this W: with q_j the columns of J A, w_j = a_j,z / z and r = 1 +- w_k, column j of D A is
+# -+ (w_k q_j / r + w_j q_k / r^2); |w| <= W, r >= 1 - W, and of q^T S^-1 q one is at most 1 and the sum of three 2.
+_SMALL = 0.13
+_AHEAD = 50.0  # tangent of the angle from the axis: from there a step of _SMALL depths leaves nothing that is seen
 
 
 @torch.no_grad()
@@ -64,6 +69,25 @@ def affine_error(scene: Gaussians, settings: GaussianRasterizationSettings) -> t
         centres = product(rows.means, view[:3, :3].T) + view[:3, 3]
         errors.append(_errors(lens, focal, near, centres, settings.scale_modifier * axes))
     return torch.cat(errors) if errors else torch.zeros(0, dtype=torch.float64)
+
+
+@torch.no_grad()
+def bends(scene: Gaussians, settings: GaussianRasterizationSettings) -> torch.Tensor:
+    """(P,) bool on the CPU: whether `affine_error`, which has the same arguments and errors, is above LIMIT.
+
+    With a pinhole it is known of most Gaussians without computing it.
+    """
+    effects = settings.effects if isinstance(settings.effects, Effects) else None
+    lens, bent = effects and effects.lens, torch.ones(len(scene.means), dtype=torch.bool)
+    is_pinhole = not lens or (lens.model == "perspective" and not any(lens.numbers()))
+    if is_pinhole and not is_orthographic(settings):
+        view = settings.viewmatrix.to(scene.means)
+        x, y, z = (product(scene.means, view[:3, :3]) + view[3, :3]).unbind(1)
+        largest = settings.scale_modifier * scene.log_scales.amax(1).exp()
+        small = (z > (effects.near if effects else NEAR)) & (largest <= _SMALL * z) & (torch.hypot(x, y) <= _AHEAD * z)
+        bent = ~small.cpu()
+    bent[bent.clone()] = affine_error(scene.rows(bent.to(scene.means.device)), settings) > LIMIT
+    return bent
 
 
 def _errors(lens: Lens, focal: torch.Tensor, near: float, centres: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:

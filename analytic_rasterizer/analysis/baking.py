@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -55,6 +55,7 @@ def bake_gain(
     training_views: Sequence[View],
     footprint: Footprint,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: Callable[[str], object] = lambda what: None,
 ) -> tuple[Gaussians, BakeGain]:
     """Bakes a scene, and measures what that gains.
 
@@ -68,6 +69,7 @@ def bake_gain(
         training_views: Those that the scene was trained from, at the size of its pictures.
         footprint: `point`, with its dilation.
         background: RGB.
+        progress: Called with what begins, once for a view.
 
     Returns:
         The baked scene, and what it gains.
@@ -89,6 +91,7 @@ def bake_gain(
         return GaussianRasterizer(settings)(means2D=None, **of.arguments())[0].clamp(0, 1).double()
 
     for view in views:
+        progress("bake")
         shown = picture(scene, view, footprint)
         for i, n in enumerate(reductions):
             framed = view.framed(n)

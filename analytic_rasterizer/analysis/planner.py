@@ -9,7 +9,7 @@ true integral is measured in docs/accuracy.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
@@ -27,7 +27,7 @@ from ..render.settings import GaussianRasterizationSettings
 from ..render.stages import Splats, Stages, project, render_stages
 from ..sh import needed_sh_degree, sh_band_bounds
 from . import timing
-from .affine import LIMIT, affine_error
+from .affine import LIMIT, bends
 from .inspection import BINS, NARROW, Candidate, EffectFinding, SceneReport, ViewReport, in_255, percent, share
 
 LADDER = sampled_footprints()  # what is tried
@@ -39,6 +39,7 @@ FINER_SHARE = 0.01  # more than this share of what it shows
 BENT_SHARE = 0.01  # of the Gaussians that a view shows: with more, their splats are said to be wrong
 SAME = 1.05  # ratio of times up to which the candidate listed first is taken
 TIMED_VIEWS = 2
+PATIENCE = 4.0  # seconds of a timing on the CPU, about: what takes long needs few rounds
 
 
 @torch.no_grad()
@@ -66,6 +67,7 @@ def inspect_scene(
     scale: float = 1.0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     rounds: int | None = None,
+    progress: Callable[[str], object] = lambda what: None,
 ) -> SceneReport:
     """Which effects and which footprint these views of a scene call for, what each changes, and what it costs.
 
@@ -81,7 +83,9 @@ def inspect_scene(
         training_views: What the scene was trained from, at their size; None: the 3D filter is not examined.
         scale: Resolution of `io.View`s among the views, as a factor.
         background: Colour behind the scene in `io.View`s.
-        rounds: Timed rounds; None: 5, of which the fastest counts, with CUDA 20, of which the median.
+        rounds: Timed rounds; None: 5, of which the fastest counts, with CUDA 20, of which the median. Fewer where they
+            would take long.
+        progress: Called with what begins, `steps_of(views)` times.
 
     Raises:
         TypeError: scene, a view or the tolerance has a wrong type.
@@ -96,6 +100,7 @@ def inspect_scene(
     shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     top_band = 0.0  # what the last band of the harmonics changes
     for camera in cameras:
+        progress("compare footprints")
         reference = _stages(scene, camera, REFERENCE, chosen.everything)
         seen.append(_touching(reference))
         shown, on_image = shown | seen[-1], on_image | (reference.radii > 0)
@@ -111,6 +116,7 @@ def inspect_scene(
 
     timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
     tried = {name: (scene, name, chosen.effects) for name in dict.fromkeys([BASE, *fitting])}
+    progress("time footprints")
     seconds = _seconds(tried, timed, rounds)
     cheapest = min(seconds[name] for name in fitting)
     footprint = next(name for name in fitting if seconds[name] <= SAME * cheapest)
@@ -118,8 +124,10 @@ def inspect_scene(
     candidates = {name: Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms}
     reports = []
     for i, camera in enumerate(cameras):
+        progress("look at views")
         name = getattr(views[i], "name", f"view_{i:03d}")
         reports.append(_view_report(scene, chosen, i, name, camera, seen[i], rms[footprint][i]))
+    progress("time effects")
     costs = _effect_costs(scene, timed, footprint, chosen.effects, shown, rounds)
     findings = (
         _footprint_finding(candidates, footprint, reports),
@@ -132,6 +140,11 @@ def inspect_scene(
     machine = timing.describe_machine(scene.means.device.type)
     found = (chosen.effects, footprint, findings, tuple(candidates.values()), tuple(reports), shown)
     return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *found)
+
+
+def steps_of(views: Sequence) -> int:
+    """How often `inspect_scene` calls `progress`."""
+    return 2 * len(views) + 2
 
 
 def _check(scene, views, tolerance, training_views, *options) -> tuple[list, list | None]:
@@ -234,7 +247,7 @@ def _seconds(cases: dict[str, tuple], cameras: list, rounds: int | None) -> dict
     for name, (scene, footprint, effects) in cases.items():
         prepared = (_prepare(scene, camera, footprint, effects) for camera in cameras)
         passes[name] = [partial(GaussianRasterizer(s), means2D=None, **gaussians) for s, gaussians in prepared]
-    samples = timing.time_calls(passes, device, rounds)
+    samples = timing.time_calls(passes, device, rounds, patience=PATIENCE)
     return {name: sum(timing.best_of(taken, device) for taken in of) for name, of in samples.items()}
 
 
@@ -262,8 +275,8 @@ def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: 
     narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
     best = candidates[footprint]
     reason = (
-        f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; every view is within "
-        f"{in_255(best.rms)}/255 of everything on"
+        f"{percent(narrow)} of the Gaussians are narrower than a pixel in these views (standard deviation below "
+        f"{NARROW:g} px); pictures are within {in_255(best.rms)}/255 of the most exact ones"
     )
     return EffectFinding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
@@ -271,9 +284,9 @@ def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: 
 def _sh_finding(scene: Gaussians, chosen: _ChosenEffects, top_band: float, cost: float | None) -> EffectFinding:
     name, degree = "spherical harmonics", chosen.effects.sh_degree
     if scene.sh_degree == 0:
-        return EffectFinding(name, False, 0.0, "bound", None, "degree 0", "the scene has none beyond degree 0")
+        return EffectFinding(name, False, 0.0, "bound", None, "degree 0", "its colours are the same from all sides")
     bounds = ", ".join(in_255(bound) for bound in chosen.bounds[1:])
-    reason = f"bands 1 to {scene.sh_degree} add at most {bounds} /255 to a colour"
+    reason = f"seen from another side, bands 1 to {scene.sh_degree} change a colour by at most {bounds} /255"
     if degree is None:
         reason += "; the last exceeds half the tolerance, and the change is what the views lose without it"
         return EffectFinding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
@@ -283,11 +296,12 @@ def _sh_finding(scene: Gaussians, chosen: _ChosenEffects, top_band: float, cost:
 
 def _filter_finding(chosen: _ChosenEffects, cost: float | None) -> EffectFinding:
     if not chosen.ratios:
-        return EffectFinding("3D filter", None, None, None, None, "none", "not examined: no training views were given")
+        reason = "not examined: that needs the views of the training (--training-views)"
+        return EffectFinding("3D filter", None, None, None, None, "none", reason)
     needed, change = chosen.effects.filter_3d is not None, chosen.filter_change
     reason = (
         f"in the view with most of them, {percent(max(share(ratio > FINER) for ratio in chosen.ratios))} of the "
-        f"Gaussians are sampled more than {FINER:g} times as finely as in any training view"
+        f"Gaussians are seen more than {FINER:g} times as large as in any view of the training"
     )
     reason += "; it changes less than a quarter of the tolerance" * (change is not None and not needed)
     kind = None if change is None else "measured"
@@ -299,22 +313,22 @@ def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float)
     hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
     count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
     reason = (
-        f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind the near plane of every "
-        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; the cost is that of "
-        "rendering them too, and `shown` of the report is the mask of the others"
+        f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind every camera or "
+        f"right before it, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; the cost "
+        "is that of rendering them too, and other views may show them"
     )
     return EffectFinding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
 def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], names: list[str]) -> EffectFinding:
     """Whether splats are the pictures of their Gaussians: the view in which most of them are not."""
-    shares = [share(affine_error(scene, camera)[of.cpu()] > LIMIT) for camera, of in zip(cameras, seen)]
+    shares = [share(bends(scene.rows(of), camera)) for camera, of in zip(cameras, seen)]
     largest = max(shares)
     needed = largest > BENT_SHARE
     view = names[shares.index(largest)]
     reason = (
-        f"the map of the camera bends over {percent(largest)} of the Gaussians that {view} shows (affine_error "
-        f"above {LIMIT}, docs/accuracy.md), which a splat cannot show"
+        f"{percent(largest)} of the Gaussians that {view} shows are so large and near that a flat splat is a poor "
+        f"picture of them (affine_error above {LIMIT}, docs/accuracy.md)"
     )
     advice = "pictures of narrower views" if needed else "as it is"
     return EffectFinding("affine picture", needed, None, None, None, advice, reason)
@@ -323,17 +337,17 @@ def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], n
 def _other_findings(chosen: _ChosenEffects, cost_of_outputs: float) -> tuple[EffectFinding, ...]:
     """Orthographic views, views whose axis is off centre, and outputs."""
     flat, off = chosen.effects.orthographic, sum(chosen.off_center)
-    w = f"w of clip space {'is the same for every position' if flat else 'depends on the position'}"
+    size = f"in these views far things look {'as large as near ones' if flat else 'smaller than near ones, as usual'}"
     edge = (
-        f"in {off} of {len(chosen.off_center)} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures "
-        "away from the optical axis"
+        f"in {off} of {len(chosen.off_center)} views the camera looks so far past the middle of the picture that an "
+        f"edge is more than {FRUSTUM_CLAMP} half pictures away"
     )
     outputs = (
-        "no scene calls for alpha, depth, other outputs, camera gradients, defocus or motion: off until asked for; the "
-        "cost is that of alpha and depth together"
+        "alpha, depth, other outputs, camera gradients, defocus and motion are off until you ask for them; the cost is "
+        "that of alpha and depth together"
     )
     return (
-        EffectFinding("orthographic", flat, None, None, None, "on" if flat else "off", w),
+        EffectFinding("orthographic", flat, None, None, None, "on" if flat else "off", size),
         EffectFinding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", edge),
         EffectFinding("outputs", False, None, None, cost_of_outputs, "off", outputs),
     )

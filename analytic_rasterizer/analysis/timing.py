@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import platform
 import statistics
 import sys
@@ -106,6 +107,7 @@ def time_calls(
     clock: Callable[[], float] = time.perf_counter,
     base: Any = None,
     progress: Callable[[], object] = lambda: None,
+    patience: float = math.inf,
 ) -> dict[Any, list[list[float]]]:
     """Seconds of every call, by key: a list of rounds for every call of a key.
 
@@ -121,6 +123,8 @@ def time_calls(
         base: A key. Where the calls of another take SLOW times as long in the round that warms up, that round counts
             and they are timed only once more. CPU only; None: all are timed in every round.
         progress: Called before every timed call.
+        patience: Seconds. Where so many rounds would take longer there are fewer, at least one, and none again; where
+            it is one, the round that warms up counts too. CPU only.
     """
     rounds = rounds or ROUNDS[device]
 
@@ -145,6 +149,11 @@ def time_calls(
         return samples
     first = in_turn(calls, measure, 1)
     totals = {key: sum(taken[0] for taken in of_key) for key, of_key in first.items()}
+    if (fitting := patience / sum(totals.values())) < rounds:
+        samples = in_turn(calls, measure, max(1, int(fitting)))
+        if fitting >= 2:
+            return samples
+        return {key: [[*a, *b] for a, b in zip(of_key, samples[key])] for key, of_key in first.items()}
     slow = {key for key in calls if base is not None and totals[key] > SLOW * totals[base]}
     samples = in_turn({key: of for key, of in calls.items() if key not in slow}, measure, rounds)
     once_more = in_turn({key: calls[key] for key in slow}, measure, 1)

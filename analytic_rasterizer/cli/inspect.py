@@ -12,7 +12,7 @@ import torch
 from .. import io
 from ..analysis.baking import bake_gain
 from ..analysis.memory import check_sizes
-from ..analysis.planner import inspect_scene
+from ..analysis.planner import inspect_scene, steps_of
 from ..io.appearance import holds_scene
 from ..training.captures import IMAGES, is_capture
 from ..training.evidence import MOST_PHOTOGRAPHS
@@ -78,6 +78,7 @@ def run(args) -> None:
         io.optional_import("matplotlib.figure", "analysis")
         if Path(args.picture).suffix.lower() not in (".png", ".svg", ".pdf"):
             raise ValueError(f"--picture must end in .png, .svg or .pdf, got {args.picture}")
+    io.optional_import("tqdm")
     use_machine(args)
     found = io.find_scene(args.scene)
     trained = found.training_footprint(args.footprint)
@@ -91,11 +92,18 @@ def run(args) -> None:
             check_writable_file(path)
     scene = io.load_scene(found.path).to(args.device)
     say(*said, f"trained with {trained.footprint}: {trained.reason}")
-    gain = None
-    if io.is_dilated(trained.footprint):
-        known = training or (found.load_views(size=args.size) if found.cameras is not None else all_views)
-        scene, gain = bake_gain(scene, views, known, trained.footprint, args.background)
-    report = inspect_scene(scene, views, args.tolerance, training, scale=1 / args.scales, background=args.background)
+    gain, is_dilated = None, io.is_dilated(trained.footprint)
+    with io.optional_import("tqdm").tqdm(total=steps_of(views) + is_dilated * len(views), disable=None) as bar:
+
+        def progress(what):
+            bar.set_description(what, refresh=False)
+            bar.update()
+
+        if is_dilated:
+            known = training or (found.load_views(size=args.size) if found.cameras is not None else all_views)
+            scene, gain = bake_gain(scene, views, known, trained.footprint, args.background, progress)
+        options = {"scale": 1 / args.scales, "background": args.background, "progress": progress}
+        report = inspect_scene(scene, views, args.tolerance, training, **options)
     if args.picture:
         report.save_picture(args.picture)
     if args.json:

@@ -32,7 +32,7 @@ from .arguments import (
     use_machine,
     writable_folder,
 )
-from .scenes import say, settle_views
+from .scenes import say, settle_views, sizes_in_words
 
 STAGES = ("project", "list_tiles", "blend")
 FILM = ".mp4"
@@ -87,7 +87,7 @@ def run(args) -> None:
     scene = io.load_scene(found.path).to(args.device)
     if args.path is not None:
         views = path_of(args, scene, views)
-    say(*said, f"footprint {choice.footprint}: {choice.reason}")
+    say(*said, f"footprint {choice.footprint}: {choice.reason}", size_in_words(views, args.scales))
     renderer = Renderer(scene, choice.footprint, args.background, args.device)
     if film:
         save_film(args, renderer, [view.scaled(1 / args.scales[0]) for view in views])
@@ -105,6 +105,15 @@ def run(args) -> None:
         rows.append(mean_of(of_scale))
     header = ["view", "size", "Gaussians", "visible", "pairs"]
     print(tables.format_table([*header, *(f"{stage} [s]" for stage in STAGES), "total [s]"], rows))
+
+
+def size_in_words(views: list[io.View], scales: tuple[float, ...]) -> str:
+    """Such as "pictures of 17x30, 1/4 of the 67x120 of the views"."""
+    made = ", ".join(sizes_in_words([view.scaled(1 / scale) for view in views]) for scale in scales)
+    if tuple(scales) == (1,):
+        return f"pictures of {made}"
+    parts = ", ".join(f"1/{scale:g}" if scale >= 1 else f"{1 / scale:g} times" for scale in scales)
+    return f"pictures of {made}: {parts} of the {sizes_in_words(views)} of the views"
 
 
 def check_options(args) -> Footprint | None:
@@ -201,7 +210,7 @@ def save_film(args, renderer: Renderer, views: list[io.View]) -> None:
     fps = FPS if args.fps is None else args.fps
     colors = (color for _, color, _ in renderer.pictures(views))
     io.save_video(args.out, colors, *sizes, fps)
-    print(f"{args.out}: {len(views)} pictures, {len(views) / fps:.1f} s")
+    print(f"{args.out}: {len(views)} pictures of {sizes_in_words(views)}, {len(views) / fps:.1f} s")
 
 
 def mean_of(rows: list[list]) -> list:

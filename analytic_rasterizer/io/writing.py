@@ -17,7 +17,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from .images import to_image
+from .images import png, to_image
 
 DISK_IS_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows has no quota of this name
 PROBE = bytes(1 << 16)
@@ -136,8 +136,14 @@ def save_image(path, picture, **options) -> None:
 
     Raises:
         OSError: As `write_safely`.
-        ImportError: Pillow is missing.
+        ImportError: Pillow is missing, which colours in a .png do not need.
         ValueError: A suffix of no format.
     """
-    image = picture if hasattr(picture, "save") else to_image(picture)
+    try:
+        image = picture if hasattr(picture, "save") else to_image(picture)
+    except ImportError:
+        if Path(path).suffix.lower() != ".png":
+            raise
+        write_bytes(path, png(picture))
+        return
     write_safely(path, lambda temporary: image.save(temporary, **options))

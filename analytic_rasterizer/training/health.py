@@ -19,6 +19,7 @@ from .schedule import Progress
 
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity
 MOST_BROKEN = 0.5  # of the Gaussians: a training that loses more at once diverges
+LEAST_SIDE = 11  # px, that of the window of SSIM
 SUDDEN_LOSS = 0.9  # of the Gaussians at once: a training that goes on, with a warning
 
 OPTION_OF = {
@@ -168,6 +169,20 @@ def warn_of_one_color(scene, pictures: Pictures) -> None:
     if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
         told = f"{scene}: all {len(finest)} photographs are of one colour, nothing can be learned"
         warnings.warn(told, stacklevel=4)  # where the training is made
+
+
+def small_pictures(pictures: Pictures) -> list[str]:
+    """A sentence about scales at which pictures are too small to learn from; none where they are not."""
+    smallest = {
+        scale: min(((s.image_width, s.image_height) for s in settings), key=min)
+        for scale, settings in pictures.settings.items()
+    }
+    small = {scale: size for scale, size in smallest.items() if min(size) < LEAST_SIDE}
+    if not small:
+        return []
+    sizes = ", ".join(f"{width}x{height} px at 1/{scale}" for scale, (width, height) in small.items())
+    told = f"pictures are small ({sizes}), and below {LEAST_SIDE} px there is little to learn"
+    return [f"warning: {told}; {flag('scales')} takes smaller numbers"]
 
 
 def _about_pictures(trainer: Trainer) -> str:

@@ -38,7 +38,7 @@ from .files import (
     write_json,
     write_scene,
 )
-from .health import finite_rows, warn_of_one_color
+from .health import finite_rows, small_pictures, warn_of_one_color
 from .interruption import interruption
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
@@ -187,8 +187,8 @@ class Run:
         """
         background = background_of(self.options, self.capture.background)
         pictures = self._load(self.capture.train, background, self.memory)
-        if pictures.store.plan.ahead:
-            self.notes.append(described(pictures.store.plan, self.device))
+        self.notes += [described(pictures.store.plan, self.device)] if pictures.store.plan.ahead else []
+        self.notes += small_pictures(pictures)
         warn_of_one_color(self.scene, pictures)
         if self.ranks.world == 1:
             self.trainer = Trainer(self.options, start, pictures, background, self.device)

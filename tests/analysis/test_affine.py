@@ -7,7 +7,7 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.analysis import affine
-from analytic_rasterizer.analysis.affine import affine_error
+from analytic_rasterizer.analysis.affine import LIMIT, affine_error, bends
 from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.gaussians import Gaussians
 
@@ -119,6 +119,36 @@ def test_what_is_not_seen(lens):
     assert affine_error(gaussians([[0, 0, 3.0]], 8.0), settings_of(lens)).isfinite().item() == wide
     assert len(affine_error(gaussians([], 1.0), settings_of(lens))) == 0
     assert affine_error(gaussians([[0, 0, 0.1]], 1e-3), settings_of(lens, near=0.05)).isfinite().all()
+
+
+@pytest.mark.parametrize("lens", [None, ar.Lens.perspective(), ar.Lens.fisheye(), "flat"], ids=str)
+def test_what_bends_is_above_the_limit(lens, monkeypatch):
+    """From tiny Gaussians to larger than their depth; with a pinhole the small ones are not looked at."""
+    generator = torch.Generator().manual_seed(2)
+    scales = scattered(3000).scales * 10 ** (2 * torch.rand(3000, 1, dtype=torch.float64, generator=generator))
+    scene = gaussians(scattered(3000, ahead=False).means, scales)
+    settings = settings_of(lens) if lens != "flat" else settings_of(orthographic=True)
+    expected, looked_at = affine_error(scene, settings) > LIMIT, []
+    monkeypatch.setattr(affine, "affine_error", lambda s, c: looked_at.append(len(s.means)) or affine_error(s, c))
+    assert torch.equal(bends(scene, settings), expected)
+    assert expected.any() == (lens != "flat") and not expected.all()
+    is_pinhole = lens is None or lens == ar.Lens.perspective()
+    assert (looked_at[0] < 2800) == is_pinhole
+
+
+def test_the_bound_of_small_gaussians_holds():
+    """What `bends` does not look at is below the limit, as far from the axis as it may be, with and without near."""
+    generator = torch.Generator().manual_seed(3)
+    rays = torch.randn(20000, 3, dtype=torch.float64, generator=generator)
+    rays[:, 2] = 1
+    rays[:, :2] *= 10 ** (2 * torch.rand(20000, 1, dtype=torch.float64, generator=generator) - 1)
+    rays = rays[rays[:, :2].norm(dim=1) < affine._AHEAD]
+    widths = torch.rand(len(rays), 3, dtype=torch.float64, generator=generator) ** 3
+    widths[:, 0] = 1
+    for size in (1.0, 1e4):
+        scene = gaussians(size * rays, affine._SMALL * size * widths)
+        assert (affine_error(scene, settings_of()) < LIMIT).all()
+    assert math.sqrt(5 / 2) * affine._SMALL / (1 - affine._SMALL) ** 2 < LIMIT
 
 
 def test_wrong_arguments():

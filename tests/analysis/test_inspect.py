@@ -170,7 +170,7 @@ def test_hidden_gaussians_change_nothing(device):
     hidden = find(found, "hidden Gaussians")
     count = 300 - int(found.shown.sum())
     assert hidden.recommendation == f"drop {count}" and hidden.change == 0
-    assert "40 behind the near plane" in hidden.reason and "60 beside every picture" in hidden.reason
+    assert "40 behind every camera" in hidden.reason and "60 beside every picture" in hidden.reason
     assert f"{count - 100} too faint" in hidden.reason
     left = scene.rows(found.shown)
     for footprint in (planner.REFERENCE, found.footprint):
@@ -308,6 +308,14 @@ def test_a_lens_belongs_to_the_camera():
     expected = ar.render_stages(settings._replace(footprint="box:samples=1", sh_degree=0), **scene.arguments())
     assert torch.equal(got.color, expected.color)
     assert planner.inspect_scene(scene, [view], rounds=1).views[0].shown > 0
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_progress_is_told_as_often_as_announced(clock, count):
+    views, told = (settings("cpu") * 2)[:count], []
+    ar.inspect_scene(random_scene("cpu", count=30), views, progress=told.append)
+    assert len(told) == planner.steps_of(views)
+    assert list(dict.fromkeys(told)) == ["compare footprints", "time footprints", "look at views", "time effects"]
 
 
 def test_splats_that_are_no_picture_of_their_gaussians():

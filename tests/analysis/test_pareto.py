@@ -273,7 +273,7 @@ def test_time_is_what_the_clock_says_before_and_after_a_call():
     assert timing.seconds_of(lambda: now.append(5.5), lambda: now[-1]) == 2.5
 
 
-def timed(monkeypatch, seconds, rounds, base="base", device="cpu"):
+def timed(monkeypatch, seconds, rounds, base="base", device="cpu", **options):
     """Samples of calls by key, whose times are taken from lists, the last for good; and how many calls there were."""
     taken = {key: iter([*of_key, *[of_key[-1]] * 99]) for key, of_key in seconds.items()}
     counts = dict.fromkeys(seconds, 0)
@@ -285,7 +285,7 @@ def timed(monkeypatch, seconds, rounds, base="base", device="cpu"):
     monkeypatch.setattr(timing, "seconds_of", clock)
     monkeypatch.setattr(timing, "event_seconds", clock)
     monkeypatch.setattr(timing, "warm_up_cuda", lambda calls, passes: None)
-    samples = timing.time_calls({key: [key] for key in seconds}, device, rounds, base=base)
+    samples = timing.time_calls({key: [key] for key in seconds}, device, rounds, base=base, **options)
     return {key: timing.best_of(of_key[0], device) for key, of_key in samples.items()}, counts
 
 
@@ -293,6 +293,13 @@ def test_slow_calls_are_timed_twice(monkeypatch):
     best, counts = timed(monkeypatch, {"base": [1.0], "slow": [timing.SLOW + 1.0]}, 5)
     assert counts == {"base": 6, "slow": 2}
     assert best["slow"] == timing.SLOW + 1
+
+
+@pytest.mark.parametrize(("patience", "calls", "best"), [(11.0, 3, 2.0), (5.0, 2, 3.0), (0.1, 2, 3.0), (99.0, 6, 1.0)])
+def test_patience_takes_rounds_away(monkeypatch, patience, calls, best):
+    """Rounds of 4 s: two, one, at least one, all five. Of fewer than two the one that warms up counts."""
+    found, counts = timed(monkeypatch, {"base": [1.0], "other": [3.0, 4.0, 2.0, 1.0]}, 5, patience=patience)
+    assert counts == {"base": calls, "other": calls} and found == {"base": 1.0, "other": best}
 
 
 @pytest.mark.parametrize(

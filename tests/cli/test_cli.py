@@ -93,8 +93,15 @@ def test_render_in_a_process(files):
     done = run(*arguments(files, "--threads", "1"))
     assert done.returncode == 0
     hint = f"right at the size of the training, for others: bake {files / 'scene.ply'} --out FILE"
-    assert done.stderr == f"footprint point:dilation=0.3: scene.ply names none, and 3DGS trains with it; {hint}\n"
+    chosen = f"footprint point:dilation=0.3: scene.ply names none, and 3DGS trains with it; {hint}"
+    assert done.stderr.splitlines() == [chosen, "pictures of 50x40 to 64x48"]
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*("view", "front", "off_centre", "mean")]
+
+
+def test_render_says_the_size_of_pictures(files, capsys):
+    assert cli.main(arguments(files, "--scales", "0.5,4")) == 0
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == "pictures of 100x80 to 128x96, 12x10 to 16x12: 2 times, 1/4 of the 50x40 to 64x48 of the views"
 
 
 def test_a_closed_stderr_changes_no_result(files, capsys, monkeypatch):

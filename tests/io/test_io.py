@@ -619,6 +619,19 @@ def test_pictures_are_clamped_and_rounded():
     assert picture[1, :, 2].tolist() == [0, 0, 0, 1, 255, 255]
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_png_needs_no_pillow(tmp_path, monkeypatch, channels):
+    color = torch.rand(channels, 7, 5, generator=torch.Generator().manual_seed(0))
+    expected = np.asarray(io.to_image(color))
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "PIL.Image", None)
+        io.save_image(tmp_path / "a.png", color)
+        with pytest.raises(ImportError):
+            io.save_image(tmp_path / "a.jpg", color)
+    with image.open(tmp_path / "a.png") as opened:
+        assert np.array_equal(np.asarray(opened), expected) and opened.mode == ("RGB", "RGBA")[channels - 3]
+
+
 def test_views_may_be_relative_to_an_offset(tmp_path):
     """Both lists keep it, and the same camera can be had in the frame of another."""
     training = pytest.importorskip("analytic_rasterizer.training", reason="needs the train extra")

@@ -120,6 +120,15 @@ def test_photographs_of_one_colour_are_told(tmp_path):
         training.Run(folder, tmp_path / "out", TrainingOptions(iterations=10, **QUICK))
 
 
+def test_pictures_that_are_too_small_are_told(tmp_path):
+    folder = write_capture(tmp_path / "data", circle(6))  # of 32x32 px
+    for scales, told in (((1, 2), False), ((1, 4, 8), True)):
+        notes = training.Run(folder, tmp_path / "out", TrainingOptions(iterations=10, scales=scales, **QUICK)).notes
+        warned = [note for note in notes if note.startswith("warning: pictures are small")]
+        assert len(warned) == told
+    assert "(8x8 px at 1/4, 4x4 px at 1/8), and below 11 px there is little to learn; --scales" in warned[0]
+
+
 def test_cameras_of_two_distances_are_no_outliers():
     """Overviews from far away beside pictures from near, more of them than one in five, or not so far."""
     near, points = circle(10), truth_gaussians().means
