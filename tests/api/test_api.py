@@ -14,7 +14,7 @@ import reference
 import scenes
 import torch
 import torch.utils._pytree
-from marks import each_precision
+from marks import each_path, each_precision
 from op_calls import Calls
 from processes import run_python
 from scenes import PATHS, RENDERED, Camera, name_of
@@ -42,7 +42,6 @@ FIELDS = (
 CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1)
 Settings = ar.GaussianRasterizationSettings
 
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 FULL = ar.Effects(
     camera_gradients=True,
     defocus=ar.Defocus(0.1, 3.0),
@@ -516,8 +515,7 @@ NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 @each_camera
 def test_non_finite_gaussians_are_culled(variant, device, dtype, number, precomputed, effects):
     """Radius 0, zero gradient, and every other Gaussian as if they were not there, to the bit."""
-    footprint, options = variant
-    settings = CAMERA.settings(dtype, device, footprint=footprint, effects=effects, **options)
+    settings = CAMERA.settings(dtype, device, variant, effects=effects)
     scene = scenes.random_scene(1, 40, degree=1)
     if precomputed:
         scene = scenes.with_precomputed(scene)
@@ -552,8 +550,7 @@ def test_degenerate_gaussians_are_harmless(variant, device, dtype, effects):
     Nothing but finiteness (and a sane image) is asked: what such a Gaussian looks like is
     undefined.
     """
-    footprint, options = variant
-    settings = CAMERA.settings(dtype, device, footprint=footprint, effects=effects, **options)
+    settings = CAMERA.settings(dtype, device, variant, effects=effects)
     scene = scenes.random_scene(1, 30, degree=1)
     values = [0.0, 1e-30, 1e-12, 1e-6, 1e6, 1e12, 1e30, -0.3]
     for i, value in enumerate(values):

@@ -8,16 +8,14 @@ import threading
 import pytest
 import scenes
 import torch
-from marks import needs_cuda
+from marks import each_path, needs_cuda
 from processes import DEADLINE, in_threads, run_python
-from scenes import KINDS, PATHS, Camera, name_of
+from scenes import KINDS, Camera
 
 import analytic_rasterizer as ar
 
 CAMERA = Camera(image_width=203, image_height=151, bg=(0.1, 0.5, 0.3), sh_degree=2)
 SMALL = Camera(image_width=20, image_height=17, sh_degree=1)
-
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 
 def scene32(seed=1, count=400, degree=2):
@@ -25,8 +23,7 @@ def scene32(seed=1, count=400, degree=2):
 
 
 def rasterizer_for(variant, camera=CAMERA, device="cpu"):
-    footprint, options = variant
-    return ar.GaussianRasterizer(camera.settings(torch.float32, device, footprint=footprint, **options))
+    return ar.GaussianRasterizer(camera.settings(torch.float32, device, variant))
 
 
 def render(rasterizer, scene, device="cpu"):

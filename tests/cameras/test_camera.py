@@ -7,11 +7,11 @@ import pytest
 import reference
 import scenes
 import torch
-from scenes import KINDS, Camera, name_of
+from marks import each_kind
+from scenes import KINDS, Camera
 
 import analytic_rasterizer as ar
 
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 CAMERA = Camera(image_height=27, image_width=35, sh_degree=1, shift=(2.3, -1.4))
 LENS = ar.Defocus(aperture=0.15, focus=3.1)
 SHUTTER = ar.Motion(0.1, velocity=(0.9, -0.6, 1.1), angular_velocity=(0.3, 0.5, -0.8), screen_velocity=(6.0, -9.0))
@@ -101,7 +101,7 @@ def pinhole(tangent, fx, fy, cx, cy, effects, dtype=torch.float64, footprint="cu
 
 
 @pytest.mark.parametrize("orthographic", [False, True], ids=["perspective", "orthographic"])
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 def test_gradcheck_of_the_pose_and_the_focal_lengths(variant, orthographic):
     """Finite differences through `moved` and `camera_settings`, and by lens, shutter and one Gaussian input."""
     footprint, options = variant

@@ -112,53 +112,27 @@ def with_features_of_unit_length(arguments):
 
 
 BALLS = {"further": {"colors": (3,)}, "change": with_colors_of_a_network, "unused": "shs rotations"}
+POSE = {"settings": {"projmatrix_raw": CAMERA.perspective().T.float()}, "change": with_a_pose}
+LANGUAGE = {"settings": {"include_feature": True}, "further": {"language_feature_precomp": (3,)}}
+LANGUAGE |= {"change": with_features_of_unit_length}
+KERNEL = {"kernel_size": 0.1, "subpixel_offset": torch.zeros(HEIGHT, WIDTH, 2)}
+SEMANTIC = {"semantic_feature": (1, 8)}
 REPOSITORIES = {
     "4DGaussians": Repository("depth", "color radii depth", chosen=True),
     "Deformable-3DGS": Repository("depth", "color radii depth", change=with_a_second_screen, densify="means2D_densify"),
     "DreamGaussian": Repository("depth_alpha", "color radii depth alpha", "color depth alpha", chosen=True),
-    "SplaTAM": Repository(
-        "luiten",
-        "color radii median",
-        further={"colors": (3,)},
-        change=with_colors_of_a_network,
-        unused="shs rotations",
-    ),
-    "MonoGS": Repository(
-        "monogs",
-        "color radii depth opacity n_touched",
-        "color depth opacity",
-        settings={"projmatrix_raw": CAMERA.perspective().T.float()},
-        change=with_a_pose,
-    ),
-    "Scaffold-GS": Repository(
-        "scaffold",
-        "color radii",
-        chosen=True,
-        further={"colors": (3,)},
-        change=with_colors_of_a_network,
-        unused="shs rotations",
-    ),
-    "LangSplat": Repository(
-        "langsplat",
-        "color feature radii",
-        "feature",
-        settings={"include_feature": True},
-        further={"language_feature_precomp": (3,)},
-        change=with_features_of_unit_length,
-        unused="shs",
-    ),
+    "SplaTAM": Repository("luiten", "color radii median", **BALLS),
+    "MonoGS": Repository("monogs", "color radii depth opacity n_touched", "color depth opacity", **POSE),
+    "Scaffold-GS": Repository("scaffold", "color radii", chosen=True, **BALLS),
+    "LangSplat": Repository("langsplat", "color feature radii", "feature", unused="shs", **LANGUAGE),
     "Gaussian Grouping": Repository("grouping", "color radii objects", "color objects", further={"sh_objs": (1, 16)}),
-    "Feature 3DGS": Repository(
-        "feature3dgs", "color semantic radii depth", "color semantic", further={"semantic_feature": (1, 8)}
-    ),
+    "Feature 3DGS": Repository("feature3dgs", "color semantic radii depth", "color semantic", further=SEMANTIC),
     "3dgs-mcmc": Repository("mcmc", "color radii is_used", chosen=True),
     "LightGaussian": Repository("lightgaussian", "color radii", settings={"f_count": False}),
     "LightGaussian, counting": Repository("lightgaussian", "counts scores color radii", settings={"f_count": True}),
     "Mini-Splatting": Repository("mini", "color radii weights pixels dominated", module=mini),
     "pixelSplat": Repository("gs2023", "color radii", change=with_covariances, camera=OFF_CENTRE),
-    "TRELLIS": Repository(
-        "mip", "color radii", settings={"kernel_size": 0.1, "subpixel_offset": torch.zeros(HEIGHT, WIDTH, 2)}
-    ),
+    "TRELLIS": Repository("mip", "color radii", settings=KERNEL),
 }
 TRAINED = {name: repository for name, repository in REPOSITORIES.items() if not repository.settings.get("f_count")}
 each_repository = pytest.mark.parametrize("repository", REPOSITORIES.values(), ids=REPOSITORIES)
@@ -268,11 +242,9 @@ def test_mcmc_moves_gaussians_to_others(on_gpu):
         most = 51
         table = torch.tensor([[float(math.comb(n, k)) if k <= n else 0.0 for k in range(most)] for n in range(most)])
         sources, copies = torch.tensor([0, 1, 2], device="cuda"), torch.tensor([2, 1, 3], device="cuda")
-        opacity, scales = drop_in.compute_relocation(
-            arguments["opacities"][sources, 0], arguments["scales"][sources], copies, table.cuda(), most
-        )
-        expected = 1 - (1 - arguments["opacities"][sources, 0]) ** (1 / copies)
-        assert torch.allclose(opacity, expected, rtol=1e-5)
+        old, sizes = arguments["opacities"][sources, 0], arguments["scales"][sources]
+        opacity, scales = drop_in.compute_relocation(old, sizes, copies, table.cuda(), most)
+        assert torch.allclose(opacity, 1 - (1 - old) ** (1 / copies), rtol=1e-5)
         index = torch.cat([torch.arange(COUNT, device="cuda"), torch.repeat_interleave(sources, copies - 1)])
         arguments["opacities"][sources, 0], arguments["scales"][sources] = opacity, scales
         moved = {name: value[index] for name, value in arguments.items()}

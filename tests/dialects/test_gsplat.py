@@ -12,6 +12,7 @@ from gsplat_calls import (
     HEIGHT,
     NEAR,
     WIDTH,
+    as_gsplat_has_it,
     assert_gradients_close,
     cameras_of,
     drop_in,
@@ -19,11 +20,11 @@ from gsplat_calls import (
     gradients,
     render,
     scene_of,
+    smooth_call,
     tolerance,
 )
-from marks import each_precision
+from marks import each_kind, each_precision
 from processes import run_python
-from scenes import name_of
 from torch.utils._python_dispatch import TorchDispatchMode
 from weights import weighted_sums, weights
 
@@ -32,7 +33,6 @@ from analytic_rasterizer.dialects import gsplat as dialect
 from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.relocation import compute_relocation
 
-RENDERED = scenes.KINDS
 BOTH_LAYOUTS = pytest.mark.parametrize("packed", [False, True], ids=["dense", "packed"])
 
 
@@ -54,28 +54,19 @@ def test_the_signature_is_gsplats():
         if ours.name != "rolling_shutter":  # gsplat's default is a value of an enumeration of its own
             assert ours.default == theirs.default, ours.name
     assert all(p.kind is inspect.Parameter.KEYWORD_ONLY for p in actual[len(expected) :])
-    image, *_ = render(
-        scene_of(torch.float32, "cpu"),
-        cameras_of(torch.float32, "cpu"),
-        rolling_shutter=inspect.signature(gsplat.rendering.rasterization).parameters["rolling_shutter"].default,
-    )
+    scene, cameras = scene_of(torch.float32, "cpu"), cameras_of(torch.float32, "cpu")
+    shutter = next(theirs.default for theirs in expected if theirs.name == "rolling_shutter")
+    image, *_ = render(scene, cameras, rolling_shutter=shutter)
     assert image.shape == (2, HEIGHT, WIDTH, 3)
 
 
 def projected(reference, scene, cameras, mode, model="pinhole"):
     """What gsplat's reference says of every Gaussian in every camera; radii by the rule of gsplat's kernels."""
     covars, _ = reference._quat_scale_to_covar_preci(scene["quats"], scene["scales"], True, False)
+    given = scene["means"], covars, cameras["viewmats"], cameras["Ks"], WIDTH, HEIGHT
+    options = {"near_plane": NEAR, "far_plane": FAR, "camera_model": model}
     _, means2d, depths, conics, amplitudes = reference._fully_fused_projection(
-        scene["means"],
-        covars,
-        cameras["viewmats"],
-        cameras["Ks"],
-        WIDTH,
-        HEIGHT,
-        near_plane=NEAR,
-        far_plane=FAR,
-        calc_compensations=mode == "antialiased",
-        camera_model=model,
+        *given, **options, calc_compensations=mode == "antialiased"
     )
     opacities = scene["opacities"].expand(len(means2d), -1)
     opacities = opacities if amplitudes is None else opacities * amplitudes
@@ -143,14 +134,8 @@ def test_meta_is_that_of_gsplats_reference(device, dtype, packed, mode, model, r
         assert meta[name].shape == expected[name].shape and meta[name].dtype == dtype
         actual = meta[name].cpu().double()[drawn]
         torch.testing.assert_close(actual, expected[name][drawn], rtol=rtol, atol=1e-5 * (rtol > 1e-5))
-    assert {k: meta[k] for k in ("width", "height", "tile_size", "tile_width", "tile_height")} == {
-        "width": WIDTH,
-        "height": HEIGHT,
-        "tile_size": 16,
-        "tile_width": 3,
-        "tile_height": 3,
-    }
-    assert meta["n_cameras"] == 2 and meta["n_batches"] == 1
+    assert (meta["width"], meta["height"], meta["n_cameras"], meta["n_batches"]) == (WIDTH, HEIGHT, 2, 1)
+    assert (meta["tile_size"], meta["tile_width"], meta["tile_height"]) == (16, 3, 3)
 
 
 def pixel_centres():
@@ -210,7 +195,7 @@ def test_images_are_gsplats_by_definition(device, dtype, mode, degree, reference
 
 @each_precision
 @BOTH_LAYOUTS
-@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@each_kind
 def test_images_and_gradients_are_the_rasterizers(device, dtype, packed, variant):
     """Of every input and of the cameras, with harmonics, alpha and depth, whatever the footprint."""
     footprint = str(ar.resolve_footprint(variant[0], **variant[1]))
@@ -273,18 +258,8 @@ def test_absolute_gradients_come_with_gradients_of_anything(device):
 @pytest.mark.parametrize("options", [{}, {"packed": False, "rasterize_mode": "antialiased", "absgrad": True}])
 @pytest.mark.parametrize("model", ["pinhole", "ortho"])
 def test_gradcheck(options, model):
-    scene, cameras = scene_of(torch.float64, "cpu"), cameras_of(torch.float64, "cpu")
-    smooth = scenes.smooth_scene(5)
-    scene = {
-        "means": smooth["means3D"],
-        "quats": smooth["rotations"],
-        "scales": smooth["scales"],
-        "opacities": smooth["opacities"][:, 0],
-        "colors": weights((6, 2), torch.float64, "cpu"),
-    }
+    leaves = scenes.leaves(smooth_call(channels=2) | {"backgrounds": torch.rand(2, 2, dtype=torch.float64)})
     size = {"width": 9, "height": 7}
-    cameras["Ks"][:, :2] *= 0.2
-    leaves = scenes.leaves({**scene, **cameras, "backgrounds": torch.rand(2, 2, dtype=torch.float64)})
 
     def images(*values):
         given = dict(zip(leaves, values)) | size
@@ -301,25 +276,13 @@ def test_gradcheck(options, model):
 
 
 def test_gradcheck_of_covariances():
-    smooth = scenes.smooth_scene(5)
-    covars, _ = dialect.quat_scale_to_covar_preci(smooth["rotations"], smooth["scales"])
-    cameras = cameras_of(torch.float64, "cpu", 1)
-    cameras["Ks"][:, :2] *= 0.2
+    given = smooth_call(channels=1) | {"width": 9, "height": 7}
+    given |= {name: given[name][:1] for name in ("viewmats", "Ks")}
+    covars, _ = dialect.quat_scale_to_covar_preci(given.pop("quats"), given.pop("scales"))
 
     def image(matrices):
         symmetric = (matrices + matrices.mT) / 2  # what is a covariance stays one
-        return rasterization(
-            smooth["means3D"],
-            None,
-            None,
-            smooth["opacities"][:, 0],
-            weights((6, 1), torch.float64, "cpu"),
-            cameras["viewmats"],
-            cameras["Ks"],
-            9,
-            7,
-            covars=symmetric,
-        )[0]
+        return rasterization(**given, quats=None, scales=None, covars=symmetric)[0]
 
     assert torch.autograd.gradcheck(image, (covars.detach().requires_grad_(),))
 
@@ -506,7 +469,7 @@ def test_meta_adds_the_variance_that_the_weight_has(footprint, sigma):
     torch.testing.assert_close(torch.stack([xx, xy, yy]), expected, rtol=rtol, atol=rtol * 0.01)
 
 
-@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@each_kind
 def test_radii_leave_out_nothing_that_shows(variant):
     """Of splats at the border of the image, the rasterizer's picture has no more."""
     footprint = str(ar.resolve_footprint(variant[0], **variant[1]))
@@ -591,6 +554,10 @@ def test_2dgs_is_refused_by_name():
         dialect.rasterization_2dgs(torch.zeros(1, 3), render_mode="RGB")
 
 
+MIRRORED = torch.tensor([[-5.0, 0, 4], [0, 5, 4], [0, 0, 1]])
+MANY = {"colors": torch.ones(6, 512), "render_mode": "RGB+D"}
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [
@@ -605,19 +572,13 @@ def test_2dgs_is_refused_by_name():
         ({"viewmats": torch.zeros(0, 4, 4)}, ValueError, "viewmats must hold at least one camera"),
         ({"viewmats": torch.eye(4)[None, None]}, ValueError, r"viewmats must have shape \(1, 4, 4\), got \(1, 1, 4, 4"),
         ({"Ks": torch.eye(3)[None]}, ValueError, r"Ks must have shape \(2, 3, 3\), got \(1, 3, 3\)"),
-        (
-            {"Ks": torch.tensor([[-5.0, 0, 4], [0, 5, 4], [0, 0, 1]]).expand(2, 3, 3)},
-            *(ValueError, "Ks must have positive focal lengths, got -5.0"),
-        ),
+        ({"Ks": MIRRORED.expand(2, 3, 3)}, ValueError, "Ks must have positive focal lengths, got -5.0"),
         ({"colors": torch.ones(5, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(5, 3\)"),
         ({"colors": torch.ones(3, 6, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(3, 6"),
         ({"colors": torch.ones(6, 3).long()}, TypeError, "colors must have the dtype of means, torch.float32, got"),
         ({"colors": torch.ones(6, 3, device="meta")}, ValueError, "colors must be on the device of means, cpu, got me"),
         ({"colors": torch.ones(6, 513)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 513"),
-        (
-            {"colors": torch.ones(6, 512), "render_mode": "RGB+D"},
-            *(ValueError, "colors must have 1 to 511 channels in render_mode RGB.D, got 512"),
-        ),
+        (MANY, ValueError, "colors must have 1 to 511 channels in render_mode RGB.D, got 512"),
         ({"colors": torch.ones(6, 0)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 0"),
         ({"sh_degree": 1}, ValueError, r"colors must have shape \(6, 6, 3\) or \(2, 6, 6, 3\), got \(6, 3\)"),
         ({"sh_degree": 1, "colors": torch.ones(6, 3, 3)}, ValueError, "colors must have 4 harmonics of degree 1, got"),
@@ -666,20 +627,15 @@ def patched(monkeypatch):
 def trained(device, count=60, seed=0):
     """Parameters as gsplat's strategies expect them, and an optimiser for each."""
     scene = scenes.cast(scenes.random_scene(seed, count, degree=1, sigma=(0.05, 0.5)), torch.float32, device)
-    params = {
-        "means": scene["means3D"],
-        "scales": scene["scales"].log(),
-        "quats": scene["rotations"],
-        "opacities": torch.logit(scene["opacities"][:, 0]),
-        "colors": scene["shs"],
-    }
+    params = as_gsplat_has_it(scene) | {"colors": scene["shs"]}
+    params |= {"scales": params["scales"].log(), "opacities": params["opacities"].logit()}
     params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
     return params, {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
 
 
 def activated(params):
     """What `rasterization` renders of them."""
-    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid()
+    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid().reshape(-1)
     return {name: params[name] for name in ("means", "quats", "colors")} | {"scales": scales, "opacities": opacities}
 
 
@@ -755,13 +711,11 @@ def test_mcmc_strategy_runs_on_our_meta(device, packed, column, patched):
     state = strategy.initialize_state()
     torch.manual_seed(0)
     for step, expected in enumerate((60, 63, 65, 65)):
-        values = {"opacities": params["opacities"].sigmoid().reshape(-1)} if column else {}
-        images, _, meta = render(activated(params) | values, cameras, sh_degree=1, packed=packed)
-        strategy.step_pre_backward(params, optimizers, state, step, meta)
-        (images - 0.5).square().mean().backward()
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+
+        def before(meta, step=step):
+            strategy.step_pre_backward(params, optimizers, state, step, meta)
+
+        _, _, meta = step_once(params, optimizers, cameras, before, packed=packed)
         strategy.step_post_backward(params, optimizers, state, step, meta, lr=1e-4)
         assert len(params["means"]) == expected
         assert all(value.isfinite().all() for value in params.values())
@@ -772,25 +726,9 @@ def test_splatfactos_call(patched, device):
     """The keywords that nerfstudio calls with, and what it does with the results."""
     params, _ = trained(device)
     cameras = cameras_of(torch.float32, device, 1)
-    render_, alpha, info = patched.rendering.rasterization(
-        means=params["means"],
-        quats=params["quats"],
-        scales=torch.exp(params["scales"]),
-        opacities=torch.sigmoid(params["opacities"][:, None]).squeeze(-1),
-        colors=params["colors"],
-        viewmats=cameras["viewmats"],
-        Ks=cameras["Ks"],
-        width=WIDTH,
-        height=HEIGHT,
-        packed=False,
-        near_plane=0.01,
-        far_plane=1e10,
-        render_mode="RGB+ED",
-        sh_degree=0,
-        sparse_grad=False,
-        absgrad=True,
-        rasterize_mode="classic",
-    )
+    options = {"near_plane": 0.01, "far_plane": 1e10, "render_mode": "RGB+ED", "sh_degree": 0, "packed": False}
+    options |= {"sparse_grad": False, "absgrad": True, "rasterize_mode": "classic", "width": WIDTH, "height": HEIGHT}
+    render_, alpha, info = patched.rendering.rasterization(**activated(params), **cameras, **options)
     rgb = (render_[:, ..., :3] + (1 - alpha) * torch.ones(3, device=device)).clamp(0, 1)
     assert rgb.squeeze(0).shape == (HEIGHT, WIDTH, 3) and render_[:, ..., 3:4].squeeze(0).shape == (HEIGHT, WIDTH, 1)
     info["means2d"].retain_grad()
@@ -884,18 +822,15 @@ def test_relocation_is_the_papers_formula(device, dtype, column):
     opacities, copies = opacities.flatten().to(dtype), copies.flatten().long()
     scales = torch.rand(20, 3, dtype=torch.float64).to(dtype)
     given = opacities[:, None] if column else opacities
-    new, new_scales = compute_relocation(
-        given.to(device), scales.to(device), copies.to(device), BINOMS.to(device, dtype), 51
-    )
+    on_device = (t.to(device) for t in (given, scales, copies, BINOMS.to(dtype)))
+    new, new_scales = compute_relocation(*on_device, 51)
     assert new.shape == given.shape and new.dtype == dtype
+    rtol = 1e-6 if dtype == torch.float32 else 1e-11
     for i in range(20):
         opacity, factor = relocated(opacities[i].item(), 1.0, copies[i].item())
-        assert new.reshape(-1)[i].item() == pytest.approx(opacity, rel=1e-6 if dtype == torch.float32 else 1e-11)
-        expected = factor * scales[i]
+        assert new.reshape(-1)[i].item() == pytest.approx(opacity, rel=rtol)
         # For an opacity of 0.999 alternating terms of up to e^7 / sqrt(7) leave a sum of 0.3.
-        torch.testing.assert_close(
-            new_scales[i].cpu(), expected, rtol=1e-6 if dtype == torch.float32 else 1e-11, atol=0
-        )
+        torch.testing.assert_close(new_scales[i].cpu(), factor * scales[i], rtol=rtol, atol=0)
 
 
 def test_relocation_checks_shapes():

@@ -16,6 +16,7 @@ from gsplat_calls import (
     gradients,
     render,
     scene_of,
+    smooth_call,
     tolerance,
 )
 from marks import each_precision
@@ -213,15 +214,13 @@ def test_images_and_gradients_of_a_lens_are_the_rasterizers(device, dtype, name)
     scene, cameras = scenes.leaves(scene_of(dtype, device, degree=1)), scenes.leaves(cameras_of(dtype, device))
     again, views = scenes.leaves(scene), scenes.leaves(cameras)
     coefficients = coefficients_of(name, dtype, device)
-    images, _, _ = render(
-        scene,
-        cameras,
-        **coefficients,
-        sh_degree=1,
-        footprint="box:samples=4",
-        camera_model=model,
-        global_z_order=model == "pinhole",
-    )
+    options = {
+        "sh_degree": 1,
+        "footprint": "box:samples=4",
+        "camera_model": model,
+        "global_z_order": model == "pinhole",
+    }
+    images, _, _ = render(scene, cameras, **coefficients, **options)
     g = weights(images.shape, dtype, device)
     total = 0
     for camera, lens in enumerate(lenses_of(name, coefficients)):
@@ -240,19 +239,7 @@ def test_images_and_gradients_of_a_lens_are_the_rasterizers(device, dtype, name)
 )
 def test_gradcheck_of_lenses(name, by_z, mode):
     """Of everything, the coefficients included, and through either depth."""
-    smooth, cameras = scenes.smooth_scene(5), cameras_of(torch.float64, "cpu")
-    cameras["Ks"][:, :2] *= 0.2
-    leaves = scenes.leaves(
-        {
-            "means": smooth["means3D"],
-            "quats": smooth["rotations"],
-            "scales": smooth["scales"],
-            "opacities": smooth["opacities"][:, 0],
-            "colors": weights((6, 1), torch.float64, "cpu"),
-            **cameras,
-            **coefficients_of(name, torch.float64, "cpu"),
-        }
-    )
+    leaves = scenes.leaves(smooth_call(channels=1) | coefficients_of(name, torch.float64, "cpu"))
     options = {"camera_model": LENSES[name][0], "global_z_order": by_z, "render_mode": mode}
 
     def sums(*values):
@@ -317,23 +304,21 @@ def test_planes_cut_a_fisheye_by_z(packed):
     torch.testing.assert_close(images, expected, rtol=0, atol=1e-12)
 
 
+def radial(*shape, **more):
+    return {"radial_coeffs": torch.zeros(*shape)} | more
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [
-        ({"radial_coeffs": torch.zeros(2, 4)}, ValueError, r"radial_coeffs must have shape \(2, 6\), got \(2, 4\)"),
-        (
-            {"radial_coeffs": torch.zeros(2, 6), "camera_model": "fisheye"},
-            *(ValueError, r"radial_coeffs must have shape \(2, 4\), got \(2, 6\)"),
-        ),
-        ({"radial_coeffs": torch.zeros(1, 6)}, ValueError, r"radial_coeffs must have shape \(2, 6\), got \(1, 6\)"),
+        (radial(2, 4), ValueError, r"radial_coeffs must have shape \(2, 6\), got \(2, 4\)"),
+        (radial(2, 6, camera_model="fisheye"), ValueError, r"radial_coeffs must have shape \(2, 4\), got \(2, 6\)"),
+        (radial(1, 6), ValueError, r"radial_coeffs must have shape \(2, 6\), got \(1, 6\)"),
         ({"tangential_coeffs": torch.zeros(2, 3)}, ValueError, r"tangential_coeffs must have shape \(2, 2\), got"),
         ({"thin_prism_coeffs": torch.zeros(2)}, ValueError, r"thin_prism_coeffs must have shape \(2, 4\), got"),
         ({"radial_coeffs": torch.zeros(2, 6).double()}, TypeError, "radial_coeffs must have the dtype of means"),
         ({"radial_coeffs": [0.0] * 6}, TypeError, "radial_coeffs must be a tensor, got list"),
-        (
-            {"radial_coeffs": torch.zeros(2, 6), "camera_model": "ortho"},
-            *(ValueError, "radial_coeffs must be None where camera_model is 'ortho'"),
-        ),
+        (radial(2, 6, camera_model="ortho"), ValueError, "radial_coeffs must be None where camera_model is 'ortho'"),
         ({"radial_coeffs": torch.full((2, 6), math.nan)}, ValueError, "every number of coefficients must be finite"),
     ],
 )
@@ -534,12 +519,10 @@ def test_everything_at_once():
     signals = weights((len(scene["means"]), 2), torch.float64, "cpu")
     options = {"render_mode": "RGB-Ed", "camera_model": "fisheye"}
     images, _, meta = render(scene, cameras, extra_signals=signals, return_normals=True, **options)
+    of_signals = render(scene | {"colors": signals}, cameras, camera_model="fisheye")[0]
     alone = {
         "images": (images, render(scene, cameras, **options)[0]),
-        "extra": (
-            meta["render_extra_signals"],
-            render(scene | {"colors": signals}, cameras, camera_model="fisheye")[0],
-        ),
+        "extra": (meta["render_extra_signals"], of_signals),
         "normals": (meta["normals"], render(scene, cameras, return_normals=True, camera_model="fisheye")[2]["normals"]),
     }
     for name, (actual, expected) in alone.items():
@@ -567,42 +550,31 @@ def test_without_splats_everything_is_empty(packed, count, by_z):
     assert total == 0 and all((leaf.grad == 0).all() for leaf in leaves.values())
 
 
+def signals(*shape, degree=None, **more):
+    return {"extra_signals": torch.ones(*shape), "extra_signals_sh_degree": degree} | more
+
+
+MORE = {"render_mode": "RGB+D", "return_normals": True}
+COLORS = {"colors": torch.ones(6, 511), "return_normals": True}
+DEGREE = {"extra_signals_sh_degree": 3}
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [
-        (
-            {"extra_signals": torch.ones(5, 2)},
-            ValueError,
-            r"extra_signals must have shape \(6, 2\) or \(2, 6, 2\), got",
-        ),
+        (signals(5, 2), ValueError, r"extra_signals must have shape \(6, 2\) or \(2, 6, 2\), got"),
         ({"extra_signals": torch.ones(6, 2).double()}, TypeError, "extra_signals must have the dtype of means"),
         ({"extra_signals": 1.0}, TypeError, "extra_signals must be a tensor, got float"),
+        (signals(6, 0), ValueError, "extra_signals must have 1 to 509 channels beside the others"),
         (
-            {"extra_signals": torch.ones(6, 0)},
+            signals(6, 508, **MORE),
             ValueError,
-            "extra_signals must have 1 to 509 channels beside the others",
+            "extra_signals must have 1 to 505 channels beside the others, got 508",
         ),
-        (
-            {"extra_signals": torch.ones(6, 508), "render_mode": "RGB+D", "return_normals": True},
-            *(ValueError, "extra_signals must have 1 to 505 channels beside the others, got 508"),
-        ),
-        (
-            {"colors": torch.ones(6, 511), "return_normals": True},
-            *(ValueError, "channels must be at most 512, depth and normals included, got 514"),
-        ),
-        (
-            {"extra_signals_sh_degree": 3},
-            ValueError,
-            "extra_signals_sh_degree must be None without extra_signals, got 3",
-        ),
-        (
-            {"extra_signals": torch.ones(6, 4, 2), "extra_signals_sh_degree": 5},
-            *(ValueError, "extra_signals_sh_degree must be 0 to 4, got 5"),
-        ),
-        (
-            {"extra_signals": torch.ones(6, 4, 2), "extra_signals_sh_degree": 3},
-            *(ValueError, "extra_signals must have 16 harmonics of degree 3, got 4"),
-        ),
+        (COLORS, ValueError, "channels must be at most 512, depth and normals included, got 514"),
+        (DEGREE, ValueError, "extra_signals_sh_degree must be None without extra_signals, got 3"),
+        (signals(6, 4, 2, degree=5), ValueError, "extra_signals_sh_degree must be 0 to 4, got 5"),
+        (signals(6, 4, 2, degree=3), ValueError, "extra_signals must have 16 harmonics of degree 3, got 4"),
     ],
 )
 def test_errors_of_what_is_rendered(change, error, message):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from marks import each_precision, needs_cuda
+from threads import assert_identical, same_on_threads
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.activations import activate
@@ -95,19 +96,13 @@ def test_nan_stays_in_its_row(device, place):
 
 def test_thread_count_changes_no_bit():
     given, weights = parameters(20_000, torch.float32), parameters(20_000, torch.float32, seed=1)
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        results.append(outputs_and_gradients(activate, given, weights))
-    for others in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], others))
+    same_on_threads(lambda: outputs_and_gradients(activate, given, weights))
 
 
 def test_strided_parameters(device):
     rows = torch.randn(30, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(device)
     parts = rows.split((3, 4, 1), 1)
-    for a, b in zip(activate(*parts), activate(*(part.contiguous() for part in parts))):
-        assert torch.equal(a, b)
+    assert_identical(activate(*parts), activate(*(part.contiguous() for part in parts)))
 
 
 def test_only_the_parameters_are_kept(device):
@@ -143,10 +138,9 @@ def test_opcheck(device):
     torch.library.opcheck(ops.activate.default, tuple(t.clone().requires_grad_() for t in given))
     torch.library.opcheck(ops.activate.default, (*(t.clone().requires_grad_() for t in given), 0.3, 0.2))
     gradients, one = [torch.ones_like(t) for t in given], torch.ones((), device=device)
+    some = [gradients[0], None, None, one]
     torch.library.opcheck(ops.activate_vjp.default, ([*gradients, None], *given, 0.0, 0.0, [], [True, True, True]))
-    torch.library.opcheck(
-        ops.activate_vjp.default, ([gradients[0], None, None, one], *given, 0.3, 0.2, [], [True, False, True])
-    )
+    torch.library.opcheck(ops.activate_vjp.default, (some, *given, 0.3, 0.2, [], [True, False, True]))
 
 
 @each_precision

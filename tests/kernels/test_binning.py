@@ -11,8 +11,8 @@ import pytest
 import reference
 import scenes
 import torch
-from marks import each_precision
-from scenes import KINDS, PATHS, RENDERED, Camera, name_of
+from marks import each_kind, each_path, each_precision
+from scenes import RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
@@ -47,9 +47,8 @@ def splats(seed, count, sigma, ratio=(1.0, 1000.0), opacity=(0.005, 1.0)):
 
 def stages(scene, variant, dtype=torch.float64, device="cpu"):
     """(stages on `device`, copied to the CPU; the settings on the CPU)."""
-    footprint, options = variant
-    settings = CAMERA.settings(dtype, footprint=footprint, **options)
-    inputs = {k: v for k, v in scenes.cast(scene, dtype, device).items() if k != "means2D"}
+    settings = CAMERA.settings(dtype, variant=variant)
+    inputs = scenes.without(scenes.cast(scene, dtype, device), "means2D")
     result = ar.render_stages(scenes.settings_to(settings, device), **inputs)
     assert all(value.device.type == device for value in result[:-1])
     return result._replace(**scenes.to(result._asdict(), "cpu")), settings
@@ -89,13 +88,9 @@ def largest_alpha_per_tile(settings, scene, variant, size=ar.TILE, block=4):
     inside = (padded[0] < CAMERA.image_height) & (padded[1] < CAMERA.image_width)
     pixels = torch.stack([padded[1], padded[0]], -1).double()
     out = []
-    for mean, cov, opacity in zip(
-        means.split(block), cov2d.split(block), scene["opacities"].double().split(block), strict=True
-    ):
-        weights = reference.sample_weights(pixels - mean[:, None, None], cov[:, None, None], footprint, **options).amax(
-            0
-        )
-        alpha = torch.where(inside, opacity[:, :, None] * weights, 0.0)
+    for mean, cov, opacity in zip(*(t.split(block) for t in (means, cov2d, scene["opacities"].double())), strict=True):
+        weights = reference.sample_weights(pixels - mean[:, None, None], cov[:, None, None], footprint, **options)
+        alpha = torch.where(inside, opacity[:, :, None] * weights.amax(0), 0.0)
         tiles = alpha.reshape(len(mean), rows, size, columns, size)
         out.append(tiles.amax((2, 4)))
     return torch.cat(out)
@@ -121,7 +116,7 @@ def test_no_visible_pixel_is_missed(variant, size):
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("variant", PATHS, ids=name_of)
+@each_path
 def test_no_visible_pixel_is_missed_float32(device, variant, size):
     """Float32, against the exact alpha of the same float32 numbers.
 
@@ -154,7 +149,7 @@ def test_lists_are_not_wasteful(device, best, variant):
 
 
 @each_precision
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 def test_lists_are_consistent(variant, device, dtype):
     scene = splats(50, 300, (0.5, 20.0))
     result, settings = stages(scene, variant, dtype, device)
@@ -199,7 +194,7 @@ def test_lists_are_consistent(variant, device, dtype):
 
 
 @each_precision
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 def test_depth_order_with_stable_ties(variant, device, dtype):
     """Front to back in every tile; among equal depths the input order. Four depths, 300 splats."""
     scene = splats(60, 300, (2.0, 20.0), (1.0, 5.0))
@@ -220,12 +215,10 @@ def test_the_peak_of_a_cumulant_weight_is_not_its_centre(device, best):
     """Below 0.3 px it dips in the middle (like the flat top it stands for), so opacity * weight(0)
     is no bound for the alpha of a pixel: here 0.96/255 at the centre and 1.02/255 beside it."""
     cov2d = torch.tensor([[0.0025, 0.0, 0.0025]], dtype=torch.float64)
-    mean = torch.tensor([[40.0, 40.3]], dtype=torch.float64)
     weights = reference.cumulant(torch.tensor([[0.0, 0.0], [0.0, 0.3]], dtype=torch.float64), cov2d)
     assert weights[1] > 1.05 * weights[0]
     opacity = 1 / (255 * weights.prod().sqrt())
-    depth = torch.tensor([2.0], dtype=torch.float64)
-    scene = scenes.splat_scene(CAMERA, mean, cov2d, opacity.reshape(1), depth)
+    scene = scenes.splat_scene(CAMERA, [[40.0, 40.3]], cov2d, opacity.reshape(1), [2.0])
     result, _ = stages(scene, ("cumulant", {}), best, device)
     assert (result.color[0] > 0).sum() == 1
     # In float32 a position is off by four roundings of 40 px, and the weight has a slope of 1/0.29 px.
@@ -239,35 +232,29 @@ def test_depths_that_differ_in_the_last_bit(device):
         depths = torch.tensor([2.0, 2.0, 2.0], dtype=dtype)
         depths[0] = torch.nextafter(depths[0], torch.tensor(3.0, dtype=dtype))
         depths[2] = torch.nextafter(depths[2], torch.tensor(1.0, dtype=dtype))
-        scene = scenes.splat_scene(
-            CAMERA,
-            torch.full((3, 2), 40.0).double(),
-            torch.tensor([[25.0, 0.0, 25.0]]).double().expand(3, 3),
-            torch.full((3,), 0.5).double(),
-            depths.double(),
-        )
+        scene = scenes.splat_scene(CAMERA, [[40.0, 40.0]] * 3, [25.0, 0.0, 25.0], [0.5] * 3, depths)
         result, _ = stages(scene, ("mip", {}), dtype, device)
         first = result.pairs[: result.tile_offsets[result.tile_offsets > 0][0]]
         assert first.tolist() == [2, 1, 0], dtype
 
 
-@pytest.mark.parametrize("samples, large, small", [(1, 16, 8), (4, 8, 8), (16, 8, 4)], ids=["1", "4", "16"])
-def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
-    """On CUDA: an image is large from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
-    key = resolve_footprint("moment", samples=samples).key
-    assert [_C.tile_size(key, 1.0, width, 512, True) for width in (512, 504)] == [large, small]
-    assert [_C.tile_size(key, 1.0, width, 512, False) for width in (512, 504)] == [16, 16]
+@pytest.mark.parametrize(
+    "footprint, side, samples, large, small",
+    [
+        *(("moment", 8, *sizes) for sizes in [(1, 16, 8), (4, 8, 8), (16, 8, 4)]),
+        *(("box", 16, *sizes) for sizes in [(1, 16, 16), (4, 16, 8), (16, 4, 4)]),
+    ],
+)
+def test_tiles_depend_on_the_image(footprint, side, samples, large, small):
+    """On CUDA, where an image is large from 4096 tiles of 8x8 px on for samples that move, and of 16x16 px for samples
+    that lanes share: four of them in small images, and sixteen in all. On the CPU all tiles have 16x16 px."""
+    key = resolve_footprint(footprint, samples=samples).key
+    height = 64 * side
+    assert [_C.tile_size(key, 1.0, width, height, True) for width in (height, height - side)] == [large, small]
+    assert [_C.tile_size(key, 1.0, width, height, False) for width in (height, height - side)] == [16, 16]
 
 
-@pytest.mark.parametrize("samples, large, small", [(1, 16, 16), (4, 16, 8), (16, 4, 4)])
-def test_tiles_of_samples_spread_over_lanes(samples, large, small):
-    """On CUDA: four samples are spread in images of less than 4096 tiles of 16x16 px, and sixteen in all."""
-    key = resolve_footprint("box", samples=samples).key
-    assert [_C.tile_size(key, 1.0, width, 1024, True) for width in (1024, 1008)] == [large, small]
-    assert [_C.tile_size(key, 1.0, width, 1024, False) for width in (1024, 1008)] == [16, 16]
-
-
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 @pytest.mark.parametrize("opacity", [0.0039, 0.0035])
 def test_faint_splats_cost_nothing(device, best, variant, opacity):
     """opacity * weight < 1/255 = 0.00392 everywhere: no contribution, no gradient, no tile.
@@ -289,7 +276,7 @@ def test_faint_splats_cost_nothing(device, best, variant, opacity):
         assert (leaves[name].grad[::2] == 0).all(), name
 
 
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 def test_radius_at_the_edge_of_the_image(device, best, variant):
     """Positive while the 3-sigma circle or any visible pixel is on screen, zero further out.
 
@@ -300,13 +287,7 @@ def test_radius_at_the_edge_of_the_image(device, best, variant):
     cov2d = torch.tensor([16.0, 0.0, 16.0], dtype=torch.float64)
     size = math.ceil(reference.three_sigma(cov2d, footprint, **options))
     for y, opacity in [(-11.5, 1.0), (-11.5, 0.05), (-13.25, 1.0), (-14.5, 1.0), (-40.0, 1.0)]:
-        scene = scenes.splat_scene(
-            CAMERA,
-            torch.tensor([[70.0, y]]).double(),
-            cov2d[None],
-            torch.tensor([opacity]).double(),
-            torch.tensor([2.0]).double(),
-        )
+        scene = scenes.splat_scene(CAMERA, [[70.0, y]], cov2d, [opacity], [2.0])
         result, _ = stages(scene, variant, best, device)
         visible = result.color.max() > 0
         assert visible == (y > -13.3 and opacity == 1)

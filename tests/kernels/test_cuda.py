@@ -5,6 +5,7 @@ Both paths round differently (fused operations, exp2 within 2 ulp), so a thresho
 rare pixels. Everything else agrees closely, and CUDA agrees with itself to the bit.
 """
 
+import contextlib
 import gc
 import math
 import re
@@ -15,9 +16,9 @@ import hard_cases
 import pytest
 import scenes
 import torch
-from marks import needs_cuda
+from marks import each_kind, every_footprint, needs_cuda
 from processes import in_threads
-from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
+from scenes import KINDS, PATHS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
@@ -36,10 +37,8 @@ SCENES = {
 # After so many frames of one size and scene, room for pairs is guessed (PairGuess::kCountedFrames, one more).
 COUNTED_FRAMES = 33
 
-every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 # Sixteen samples have a lane each, as four have in small images, and other tiles.
 each_path = pytest.mark.parametrize("variant", [*PATHS, ("box", {"samples": 16})], ids=name_of)
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 # On CUDA, sums of absolute values over sixteen samples add up lanes.
 each_sum_of_absolute_values = pytest.mark.parametrize("variant", [*KINDS, ("box", {"samples": 16})], ids=name_of)
 
@@ -58,26 +57,41 @@ def scene32(name="some"):
 
 def without_means2d(scene):
     """What `render_stages` takes."""
-    return {name: value for name, value in scene.items() if name != "means2D"}
+    return scenes.without(scene, "means2D")
+
+
+def lengths_of_lists(scene, settings):
+    """Numbers of splats in the lists of all tiles on CUDA."""
+    stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
+    return stages.tile_offsets.diff()
+
+
+@contextlib.contextmanager
+def room_for_pairs(count):
+    """Room for so many pairs, whatever comes."""
+    _C.force_pair_capacity(count)
+    try:
+        yield
+    finally:
+        _C.force_pair_capacity(0)
 
 
 def settings_for(variant, camera=CAMERA, device="cpu"):
-    footprint, options = variant
-    return camera.settings(torch.float32, device, footprint=footprint, **options)
+    return camera.settings(torch.float32, device, variant)
 
 
 def with_channels(scene, settings, channels):
     """The scene with random channels in place of colours, and the settings with a background of as many."""
     g = torch.Generator().manual_seed(5)
-    scene = {name: value for name, value in scene.items() if name != "shs"}
-    scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
-    return scene, settings._replace(bg=scenes.rand(g, channels).float())
+    colors = scenes.rand(g, len(scene["means3D"]), channels).float()
+    return scenes.without(scene, "shs") | {"colors_precomp": colors}, settings._replace(
+        bg=scenes.rand(g, channels).float()
+    )
 
 
 def backward(color):
     """Of sum(color * fixed weights)."""
-    g = torch.Generator().manual_seed(3)
-    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
+    (color * scenes.probe(color, seed=3)).sum().backward()
 
 
 def run(scene, settings, device):
@@ -203,20 +217,7 @@ def test_trained_scene(plant, variant):
     """Real scales and opacities, at the scene's low resolution."""
     scene, views = plant
     for view in views[:2]:
-        world_to_camera = torch.tensor(view["w2c"], dtype=torch.float64).reshape(4, 4)
-        camera = Camera(
-            image_width=view["width"],
-            image_height=view["height"],
-            tanfovx=view["width"] / (2 * view["fx"]),
-            tanfovy=view["height"] / (2 * view["fy"]),
-            sh_degree=3,
-        )
-        settings = settings_for(variant, camera)._replace(
-            viewmatrix=world_to_camera.T.float().contiguous(),
-            projmatrix=(camera.perspective() @ world_to_camera).T.float().contiguous(),
-            campos=torch.linalg.inv(world_to_camera)[:3, 3].float().contiguous(),
-        )
-        compare(scene, settings)
+        compare(scene, scenes.of_view(view, variant, dtype=torch.float32))
 
 
 LONG_LISTS = {
@@ -258,15 +259,10 @@ def test_moving_samples_with_a_list_for_each_pixel(samples):
     """A tile's list of thousands, of which a pixel meets few: blended pixel by pixel, differentiated in segments."""
     scene = splats_smaller_than_a_pixel()
     settings = settings_for(("moment", {"samples": samples}), Camera(image_height=24, image_width=40))
-    stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
-    lists = stages.tile_offsets.diff()
+    lists = lengths_of_lists(scene, settings)
     assert lists.max() > 4 * 1024, "too few segments"
     assert samples <= 4 or ((lists > 0) & (lists < 4096)).any(), "all lists are cut"
-    color = compare(scene, settings, flips=1e-2, layers=2350)  # as in test_long_lists
-    assert_same_without_gradient(scene, settings, color)
-    first, second = run(scene, settings, "cuda"), run(scene, settings, "cuda")
-    assert torch.equal(first.color, second.color)
-    assert all(torch.equal(grad, second.grads[name]) for name, grad in first.grads.items())
+    check_long_lists(scene, settings)
 
 
 @pytest.mark.parametrize("samples", [1, 4, 16])
@@ -275,9 +271,13 @@ def test_longest_lists_of_moving_samples(samples):
     scene = splats_smaller_than_a_pixel()
     scene["means3D"] *= 0.2
     settings = settings_for(("moment", {"samples": samples}), Camera(image_height=24, image_width=40))
-    stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
-    assert stages.tile_offsets.diff().max() > (16384 if samples <= 4 else 4096), "no list is among the longest"
-    color = compare(scene, settings, flips=1e-2, layers=2350)  # as in test_long_lists
+    longest = lengths_of_lists(scene, settings).max()
+    assert longest > (16384 if samples <= 4 else 4096), "no list is among the longest"
+    check_long_lists(scene, settings)
+
+
+def check_long_lists(scene, settings, flips=1e-2, layers=2350):  # as in test_long_lists
+    color = compare(scene, settings, flips=flips, layers=layers)
     assert_same_without_gradient(scene, settings, color)
     assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
 
@@ -295,12 +295,9 @@ def test_a_list_for_each_pixel_changes_no_alpha():
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings._replace(effects=effects), "cuda"))
     with torch.no_grad():
         color, _, outputs = rasterizer(**scenes.to(scene, "cuda"))
-        _C.force_pair_capacity(64)
-        try:
+        with room_for_pairs(64):
             assert_more_pairs_than_room(scene, settings)
             other_color, _, other_outputs = rasterizer(**scenes.to(scene, "cuda"))
-        finally:
-            _C.force_pair_capacity(0)
     assert torch.equal(other_outputs.alpha, outputs.alpha)
     layers = 2350  # at most in a pixel, as above
     torch.testing.assert_close(other_color, color, rtol=layers * torch.finfo(torch.float32).eps, atol=1e-7)
@@ -346,16 +343,13 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
     if channels != 3:
         scene, settings = with_channels(scene, settings, channels)
     else:
-        stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
-        lists = stages.tile_offsets.diff()
+        lists = lengths_of_lists(scene, settings)
         assert lists.max() > 4096, "no list is cut"
         assert ((lists > 0) & (lists < 4096)).sum() > 100, "all lists are cut"
-    color = compare(scene, settings, flips=1e-3, layers=500)
-    assert_same_without_gradient(scene, settings, color)
-    assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
+    check_long_lists(scene, settings, flips=1e-3, layers=500)
 
 
-@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@every_footprint
 @pytest.mark.parametrize("size", [40, 1040])
 def test_the_backward_pass_composites_what_the_forward_pass_did(variant, size):
     """Both passes compute alphas, which have to be the same bits: a splat that one composites and the other does not
@@ -404,14 +398,11 @@ def test_the_kernels_of_a_picture_are_those_of_the_table(variant, channels, came
     capacity, leaves = 1 << 16, scenes.leaves(scenes.to(scene, "cuda"))
     size = (camera.image_width, camera.image_height)
     forward, backward = _C.blend_route(settings.footprint.key, channels, *size, capacity)
-    _C.force_pair_capacity(capacity)
-    try:
+    with room_for_pairs(capacity):
         image, launched = launched_kernels(lambda: ar.GaussianRasterizer(settings)(**leaves)[0])
         assert launched == set(forward)
         _, launched = launched_kernels(lambda: image.sum().backward())
         assert launched == set(backward)
-    finally:
-        _C.force_pair_capacity(0)
 
 
 @pytest.mark.parametrize("samples, camera", [(1, LARGE), (4, LARGE), (16, CAMERA)], ids=["16x16", "8x8", "4x4"])
@@ -433,12 +424,9 @@ def test_looks_at_moving_samples(samples, camera):
 def test_more_pairs_than_room_where_lists_would_be_cut(samples, camera):
     """There is room for segments, and no list to cut."""
     scene, settings = long_and_short_lists(), settings_for(("moment", {"samples": samples}), camera)
-    _C.force_pair_capacity(1 << 14)
-    try:
+    with room_for_pairs(1 << 14):
         assert_more_pairs_than_room(scene, settings)
         compare(scene, settings, flips=1e-3, layers=500)
-    finally:
-        _C.force_pair_capacity(0)
 
 
 @every_footprint
@@ -457,9 +445,8 @@ def test_a_splat_that_fills_the_screen(variant):
 @pytest.fixture
 def little_room():
     """Room for 64 pairs, or for one of each Gaussian, whatever comes."""
-    _C.force_pair_capacity(64)
-    yield
-    _C.force_pair_capacity(0)
+    with room_for_pairs(64):
+        yield
 
 
 def assert_more_pairs_than_room(scene, settings):
@@ -527,6 +514,14 @@ def test_many_more_pairs_than_in_the_frame_before(variant):
     compare(scene, small)
 
 
+def nothing_to_see(which):
+    """A scene of no Gaussians, or one behind the camera."""
+    scene = scene32()
+    if which == "none":
+        return {name: value[:0] for name, value in scene.items()}
+    return dict(scene, means3D=scene["means3D"] + torch.tensor([0.0, 0.0, -50.0]))
+
+
 @each_path
 def test_other_numbers_of_gaussians_in_between(variant, waiting_is_an_error):
     """None, none visible, few, many, in turn: room is guessed for each after the frames that are counted, without
@@ -534,12 +529,8 @@ def test_other_numbers_of_gaussians_in_between(variant, waiting_is_an_error):
     camera = replace(CAMERA, image_width=187, image_height=131)
     settings = settings_for(variant, camera)
     many = scene32()
-    scenes_in_turn = {
-        "none": {name: value[:0] for name, value in many.items()},
-        "behind": dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0])),
-        "few": {name: value[:100] for name, value in many.items()},
-        "many": many,
-    }
+    few = {name: value[:100] for name, value in many.items()}
+    scenes_in_turn = {"none": nothing_to_see("none"), "behind": nothing_to_see("behind"), "few": few, "many": many}
     expected = {name: run(scene, settings, "cpu").color for name, scene in scenes_in_turn.items()}
     on_device = {name: scenes.to(scene, "cuda") for name, scene in scenes_in_turn.items()}
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
@@ -565,11 +556,7 @@ def test_other_numbers_of_gaussians_in_between(variant, waiting_is_an_error):
 
 @pytest.mark.parametrize("name", ["none", "behind"])
 def test_nothing_to_see_has_no_gradient(name):
-    settings, many = settings_for(("box", {})), scene32()
-    nothing = {
-        "none": {name: value[:0] for name, value in many.items()},
-        "behind": dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0])),
-    }[name]
+    settings, nothing = settings_for(("box", {})), nothing_to_see(name)
     actual = run(nothing, settings, "cuda")
     assert (actual.color == torch.tensor(CAMERA.bg)[:, None, None]).all()
     assert (actual.radii == 0).all()
@@ -770,22 +757,28 @@ def waiting_is_an_error():
     torch.cuda.set_sync_debug_mode("default")
 
 
+@pytest.fixture
+def never_waits(waiting_is_an_error):
+    """A function that calls a frame three times, in which waiting is an error."""
+
+    def check(frame):
+        waiting_is_an_error()
+        for _ in range(3):
+            frame()
+
+    return check
+
+
 @each_path
-def test_nothing_waits_for_the_device(variant, waiting_is_an_error):
+def test_nothing_waits_for_the_device(variant, never_waits):
     """After the frames that are counted. torch reports the waiting that it does itself."""
-    frame = frames(variant)
-    waiting_is_an_error()
-    for _ in range(3):
-        frame()
+    never_waits(frames(variant))
 
 
-def test_effects_do_not_wait_for_the_device(waiting_is_an_error):
+def test_effects_do_not_wait_for_the_device(never_waits):
     lens, shutter = ar.Defocus(0.1, 3.0), ar.Motion(0.1, velocity=(1.0, 0.0, 0.5))
     outputs = dict.fromkeys(("alpha", "depth", "median_depth", "dominant_index", "gaussian_stats"), True)
-    frame = frames(("box", {}), effects=ar.Effects(**outputs, off_center=True, defocus=lens, motion=shutter))
-    waiting_is_an_error()
-    for _ in range(3):
-        frame()
+    never_waits(frames(("box", {}), effects=ar.Effects(**outputs, off_center=True, defocus=lens, motion=shutter)))
 
 
 @each_path
@@ -820,12 +813,24 @@ EFFECTS = {
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_effects_of_the_camera_do_not_wait(name, waiting_is_an_error):
+def test_effects_of_the_camera_do_not_wait(name, never_waits):
     number = torch.full((1,), 0.2, device="cuda")
-    frame = frames(("box", {}), effects=ar.Effects(**EFFECTS[name](number)))
-    waiting_is_an_error()
-    for _ in range(3):
-        frame()
+    never_waits(frames(("box", {}), effects=ar.Effects(**EFFECTS[name](number))))
+
+
+def captured(work):
+    """A CUDA graph of work(), which has run three times on another stream before, and what it returned."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(side)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        made = work()
+    return graph, made
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -835,20 +840,11 @@ def test_effects_of_the_camera_in_a_cuda_graph(name):
     number, view = torch.full((1,), 0.2, device="cuda"), settings.viewmatrix.clone()
 
     def frame():
-        return ar.GaussianRasterizer(settings._replace(viewmatrix=view, effects=ar.Effects(**EFFECTS[name](number))))(
-            **scene
-        )[0]
+        effects = ar.Effects(**EFFECTS[name](number))
+        return ar.GaussianRasterizer(settings._replace(viewmatrix=view, effects=effects))(**scene)[0]
 
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.no_grad(), torch.cuda.stream(side):
-        for _ in range(3):
-            frame()
-    torch.cuda.current_stream().wait_stream(side)
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.no_grad(), torch.cuda.graph(graph):
-        color = frame()
+    with torch.no_grad():
+        graph, color = captured(frame)
     seen = []
     for worth, shift in ((0.2, 0.0), (0.4, 0.0), (0.4, 0.1)):
         number.fill_(worth)
@@ -869,16 +865,8 @@ def test_cuda_graph(variant):
     scene, settings = scene32(), settings_for(variant)
     static = scenes.to(scene, "cuda")
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.no_grad(), torch.cuda.stream(side):
-        for _ in range(3):
-            rasterizer(**static)
-    torch.cuda.current_stream().wait_stream(side)
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.no_grad(), torch.cuda.graph(graph):
-        color, radii = rasterizer(**static)
+    with torch.no_grad():
+        graph, (color, radii) = captured(lambda: rasterizer(**static))
     changed = dict(scene, means3D=scene["means3D"] * 0.9, opacities=scene["opacities"] * 0.7)
     for case in (scene, changed, scene):
         for name, value in case.items():
@@ -910,16 +898,7 @@ def replay_a_graph_with_gradients(scene, settings):
         color, _ = rasterizer(**leaves)
         return color, torch.autograd.grad((color * weights).sum(), list(leaves.values()))
 
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):
-            step()
-    torch.cuda.current_stream().wait_stream(side)
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        color, grads = step()
+    graph, (color, grads) = captured(step)
     for factor in (1.0, 0.7, 1.0):
         with torch.no_grad():
             leaves["opacities"].copy_(scene["opacities"] * factor)
@@ -982,20 +961,18 @@ def test_out_of_memory(keep, little_memory):
 # --- errors ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["opacities", "means2D", "shs", "scales", "rotations"])
-def test_inputs_on_the_cpu_are_refused(name):
-    scene = scene32("few")
-    mixed = scenes.to(scene, "cuda") | {name: scene[name]}
-    with pytest.raises(ValueError, match=rf"{name} must .*cuda.*got cpu"):
-        ar.GaussianRasterizer(settings_for(("mip", {}), device="cuda"))(**mixed)
+CAMERA_TENSORS = ("bg", "viewmatrix", "projmatrix", "campos")
 
 
-@pytest.mark.parametrize("name", ["bg", "viewmatrix", "projmatrix", "campos"])
-def test_settings_on_the_cpu_are_refused(name):
-    settings = settings_for(("mip", {}), device="cuda")
-    mixed = settings._replace(**{name: getattr(settings, name).cpu()})
+@pytest.mark.parametrize("name", ["opacities", "means2D", "shs", "scales", "rotations", *CAMERA_TENSORS])
+def test_inputs_and_settings_on_the_cpu_are_refused(name):
+    scene, settings = scenes.to(scene32("few"), "cuda"), settings_for(("mip", {}), device="cuda")
+    if name in CAMERA_TENSORS:
+        settings = settings._replace(**{name: getattr(settings, name).cpu()})
+    else:
+        scene[name] = scene[name].cpu()
     with pytest.raises(ValueError, match=rf"{name} must .*cuda.*got cpu"):
-        ar.GaussianRasterizer(mixed)(**scenes.to(scene32("few"), "cuda"))
+        ar.GaussianRasterizer(settings)(**scene)
 
 
 def test_other_mixtures_are_refused():
@@ -1018,7 +995,7 @@ def test_float64_is_refused():
         ar.render_stages(settings, **scene)
 
 
-@pytest.mark.parametrize("name", ["bg", "viewmatrix", "projmatrix", "campos"])
+@pytest.mark.parametrize("name", CAMERA_TENSORS)
 def test_a_camera_that_is_not_finite(name, tmp_path, monkeypatch):
     """Looked at with debug only, because that waits; without, the frame is undefined but no error, and the
     next one is right."""

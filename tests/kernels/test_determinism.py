@@ -5,13 +5,13 @@ depend on the instruction set.
 import pytest
 import scenes
 import torch
-from marks import each_precision
+from marks import each_path, each_precision, every_footprint
 from processes import run_python
-from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, Camera, name_of
+from scenes import KINDS, REFERENCE_FOOTPRINTS, RENDERED, Camera, name_of
+from threads import assert_identical, same_on_threads
 
 import analytic_rasterizer as ar
 
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 each_weight = pytest.mark.parametrize("variant", [*KINDS, *((name, {}) for name in REFERENCE_FOOTPRINTS)], ids=name_of)
 each_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
@@ -21,13 +21,10 @@ CAMERA = Camera(image_width=203, image_height=151, bg=(0.1, 0.5, 0.3), sh_degree
 
 def everything(camera, scene, variant, dtype, device="cpu"):
     """Image, radii, all gradients, and the stages, computed on `device`."""
-    footprint, options = variant
-    settings = camera.settings(dtype, device, footprint=footprint, **options)
+    settings = camera.settings(dtype, device, variant)
     leaves = scenes.leaves(scenes.cast(scene, dtype, device))
     color, radii = ar.GaussianRasterizer(settings)(**leaves)
-    g = torch.Generator().manual_seed(1)
-    loss = scenes.rand(g, *color.shape, low=-1.0).to(color)
-    (color * loss).sum().backward()
+    (color * scenes.probe(color, seed=1)).sum().backward()
     inputs = {name: value.detach() for name, value in leaves.items() if name != "means2D"}
     stages = ar.render_stages(settings, **inputs)
     results = [color.detach(), radii, *(leaf.grad for leaf in leaves.values()), *stages[:-1]]
@@ -35,22 +32,12 @@ def everything(camera, scene, variant, dtype, device="cpu"):
     return [result.cpu() for result in results]
 
 
-def assert_identical(first, second):
-    for a, b in zip(first, second, strict=True):
-        assert torch.equal(a, b)
-
-
 @each_path
 @each_dtype
 def test_thread_count_changes_no_bit(variant, dtype):
     scene = scenes.random_scene(1, 400, degree=2, sigma=(0.01, 0.4))
     scene["means2D"] = torch.zeros(400, 4, dtype=torch.float64)
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        results.append(everything(CAMERA, scene, variant, dtype))
-    assert_identical(results[0], results[1])
-    assert_identical(results[0], results[2])
+    same_on_threads(lambda: everything(CAMERA, scene, variant, dtype))
 
 
 @pytest.mark.parametrize("size", [(600, 400), (3, 50000), (50000, 3)], ids=str)
@@ -58,17 +45,16 @@ def test_thread_count_changes_no_bit_of_the_gradient_of_one_background(size):
     """A single number, of which torch's threads would each add up a part."""
     width, height = size
     camera = Camera(image_width=width, image_height=height)
-    scene = scenes.cast(scenes.random_scene(1, 40), torch.float32) | {"colors_precomp": torch.ones(40, 1)}
-    del scene["shs"]
+    scene = scenes.without(scenes.cast(scenes.random_scene(1, 40), torch.float32), "shs")
     weights = torch.randn(1, height, width, generator=torch.Generator().manual_seed(1))
-    found = set()
-    for threads in (1, 2, 3, 4, 7):
-        torch.set_num_threads(threads)
+
+    def gradient():
         bg = torch.zeros(1, requires_grad=True)
-        color, _ = ar.GaussianRasterizer(camera.settings(torch.float32)._replace(bg=bg))(**scene)
-        color.backward(weights)
-        found.add(bg.grad.item())
-    assert len(found) == 1
+        settings = camera.settings(torch.float32)._replace(bg=bg)
+        color, _ = ar.GaussianRasterizer(settings)(**scene, colors_precomp=torch.ones(40, 1))
+        return torch.autograd.grad(color, bg, weights)
+
+    same_on_threads(gradient, (1, 2, 3, 4, 7))
 
 
 @each_path
@@ -87,14 +73,13 @@ def test_weight_function_is_deterministic(device, variant):
     g = torch.Generator().manual_seed(3)
     cov2d = scenes.random_cov2d(g, 20000, (0.1, 5.0)).float()
     offset = scenes.random_offsets(g, cov2d.double()).float()
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
+
+    def weights():
         d, c = (tensor.to(device, copy=True).requires_grad_() for tensor in (offset, cov2d))
         value = ar.footprint_weight(d, c, footprint=footprint, **options)
-        results.append((value.detach(), *torch.autograd.grad(value.sum(), (d, c))))
-    assert_identical(results[0], results[1])
-    assert_identical(results[0], results[2])
+        return value.detach(), *torch.autograd.grad(value.sum(), (d, c))
+
+    same_on_threads(weights)
 
 
 @each_path
@@ -126,20 +111,18 @@ EVERY_RESULT = """
 import os
 import sys
 import torch
-import scenes, test_determinism as determinism
+import scenes, threads, test_determinism as determinism
 import analytic_rasterizer as ar
 
 if ar.instruction_set() != os.environ["ANALYTIC_RASTERIZER_ISA"]:
     sys.exit()  # the machine does not have it: what it took in its place has a run of its own
-results = {}
+results, dtype32 = {}, torch.float32
 for variant in scenes.RENDERED:
-    for dtype in (torch.float32, torch.float64):
+    for dtype in (dtype32, torch.float64):
         torch.set_num_threads(1)
         results[scenes.name_of(variant), dtype] = determinism.of_levels(variant, dtype)
     torch.set_num_threads(3)
-    determinism.assert_identical(
-        results[scenes.name_of(variant), torch.float32], determinism.of_levels(variant, torch.float32)
-    )
+    threads.assert_identical(results[scenes.name_of(variant), dtype32], determinism.of_levels(variant, dtype32))
 torch.save(results, sys.argv[1])
 print(ar.instruction_set(), end="")
 """
@@ -187,7 +170,7 @@ TYPICAL = 4 * 2.0**-24
 GRADIENT, GRADIENT_OF_FLIP = 8e-6, 1e-4
 
 
-@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@every_footprint
 def test_instruction_sets(levels, variant):
     """Measured: baseline against the others 5e-7 in the image where nothing flips, 4e-8 RMS, 1.4e-6 of the gradients;
     AVX2 against AVX-512 8e-7 of the gradients."""
@@ -211,7 +194,7 @@ def test_instruction_sets(levels, variant):
         assert gradients < GRADIENT
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@each_dtype
 def test_another_process_gives_the_same_bits(levels, dtype):
     for variant in RENDERED:
         expected = levels[ar.instruction_set()][name_of(variant), dtype]
@@ -245,14 +228,9 @@ def test_odd_image_shapes(device, variant, size):
     """Few rows and many tiles, or the reverse. (Their values: test_render_reference.py.)"""
     camera = Camera(image_width=size[0], image_height=size[1], sh_degree=2)
     scene = scenes.random_scene(7, 60, degree=2, sigma=(0.05, 0.8), spread=1.0)
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        results.append(everything(camera, scene, variant, torch.float32, device))
-    assert results[0][0].shape == (3, size[1], size[0])
-    assert (results[0][0] > 0).any()
-    assert_identical(results[0], results[1])
-    assert_identical(results[0], results[2])
+    color, *_ = same_on_threads(lambda: everything(camera, scene, variant, torch.float32, device))
+    assert color.shape == (3, size[1], size[0])
+    assert (color > 0).any()
 
 
 @each_path
@@ -275,13 +253,7 @@ def test_all_culled(device, variant):
 def test_empty_tiles(device, variant):
     """One small splat in a large image: every other tile is plain background."""
     camera = Camera(image_width=200, image_height=120, bg=(0.2, 0.4, 0.8)).facing_z()
-    scene = scenes.splat_scene(
-        camera,
-        torch.tensor([[100.0, 60.0]]).double(),
-        torch.tensor([[2.0, 0.3, 1.0]]).double(),
-        torch.tensor([0.9]).double(),
-        torch.tensor([2.0]).double(),
-    )
+    scene = scenes.splat_scene(camera, [[100.0, 60.0]], [2.0, 0.3, 1.0], [0.9], [2.0])
     color, *_ = everything(camera, scene, variant, torch.float32, device)
     background = torch.tensor(camera.bg)[:, None, None]
     changed = (color != background).any(0)

@@ -7,12 +7,11 @@ import pytest
 import reference
 import scenes
 import torch
-from scenes import KINDS, PATHS, Camera, name_of
+from marks import each_kind, each_path
+from scenes import Camera
 
 import analytic_rasterizer as ar
 
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 CAMERA = Camera(image_height=29, image_width=37, sh_degree=1)
 ALL = ar.Effects(alpha=True, depth=True, inverse_depth=True)
 
@@ -47,10 +46,9 @@ def depths(scene, camera=CAMERA):
 def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
     """What rendering those three colours alone gives: bit for bit on the CPU, where any number of channels takes the
     same steps; on CUDA, whose kernel for many channels adds up samples in another order, to rounding."""
-    footprint, options = variant
     scene = scenes.cast(colored(scenes.random_scene(3, 50), channels), best)
     bg = torch.linspace(0.1, 0.9, channels, dtype=best)
-    settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), bg)
+    settings = with_bg(CAMERA.settings(best, variant=variant), bg)
     inputs = scenes.leaves(scenes.to(scene, device))
     color, radii = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**inputs)
     assert color.shape == (channels, 29, 37)
@@ -130,9 +128,8 @@ def test_background_image(device, best):
 @each_path
 def test_gradients_add_up_over_the_groups(device, best, variant):
     """d/d(all channels) is the sum of what each group of three gives alone."""
-    footprint, options = variant
     scene = scenes.cast(colored(scenes.random_scene(9, 60), 7), best)
-    settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), torch.linspace(0, 1, 7, dtype=best))
+    settings = with_bg(CAMERA.settings(best, variant=variant), torch.linspace(0, 1, 7, dtype=best))
     g = torch.rand(7, 29, 37, generator=torch.Generator().manual_seed(2), dtype=best)
     whole = scenes.leaves(scenes.to(scene, device))
     ar.GaussianRasterizer(scenes.settings_to(settings, device))(**whole)[0].backward(g.to(device))
@@ -159,12 +156,11 @@ def test_gradients_add_up_over_the_groups(device, best, variant):
 @pytest.mark.parametrize("count", [60, 3000], ids=["few", "several chunks"])
 def test_gradients_of_alpha(device, best, variant, count):
     """Those of what a white background shows more than a black one; with lists of more than a chunk of a tile too."""
-    footprint, options = variant
     scene = scenes.cast(scenes.random_scene(10, count, opacity=(0.02, 0.2), sigma=(0.05, 0.3)), best)
     camera = Camera(image_height=21, image_width=23)
     g = torch.rand(1, 21, 23, generator=torch.Generator().manual_seed(4), dtype=best).to(device)
     leaves = scenes.leaves(scenes.to(scene, device))
-    settings = camera.settings(best, device, footprint=footprint, **options)
+    settings = camera.settings(best, device, variant)
     _, _, outputs = ar.GaussianRasterizer(settings._replace(effects=ar.Effects(alpha=True)))(**leaves)
     (outputs.alpha * g).sum().backward()
     others = scenes.leaves(scenes.to(scene, device))
@@ -220,13 +216,12 @@ def test_depth_gradient_of_a_culled_gaussian_is_zero(device, best):
 @each_path
 def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
     """On CUDA depth takes a kernel of more channels, whose sums round differently."""
-    footprint, options = variant
     scene = scenes.cast(scenes.random_scene(11, 60, degree=1), best)
     results = []
     asked = (None, ar.Effects(), ar.Effects(alpha=True), ar.Effects(depth=True), ALL)
     for effects in asked:
         leaves = scenes.leaves(scenes.to(scene, device))
-        settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
+        settings = CAMERA.settings(best, device, variant, effects=effects)
         color, radii, *outputs = ar.GaussianRasterizer(settings)(**leaves)
         assert len(outputs) == (effects is not None and effects.has_outputs)
         color.square().sum().backward()
@@ -309,12 +304,11 @@ def test_effects_and_settings():
 @each_kind
 def test_looks_match_the_weights(device, best, variant):
     """Weights of all Gaussians from one channel each: the largest, the one at half of the light, sums over pixels."""
-    footprint, options = variant
     count = 24
     scene = scenes.cast(colored(scenes.random_scene(14, count, opacity=(0.3, 0.98), sigma=(0.15, 0.6)), 3), best)
     scene["colors_precomp"] = torch.eye(count, dtype=best)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
-    settings = CAMERA.settings(best, device, footprint=footprint, effects=looks, **options)
+    settings = CAMERA.settings(best, device, variant, effects=looks)
     settings = with_bg(settings, torch.zeros(count, dtype=best, device=device))
     weights, _, outputs = ar.GaussianRasterizer(settings)(**scenes.to(scene, device))
     weights, eps = weights.cpu(), 32 * torch.finfo(best).eps
@@ -357,13 +351,12 @@ def test_looks_match_the_weights(device, best, variant):
 @each_kind
 def test_looks_do_not_depend_on_each_other(device, best, variant):
     """What is left out lets a pixel be closed earlier, and changes no bit."""
-    footprint, options = variant
     scene = scenes.cast(scenes.random_scene(16, 300, degree=1, sigma=(0.05, 0.6)), best, device)
     looks = ("median_depth", "dominant_index", "gaussian_stats")
 
     def outputs(*names):
         effects = ar.Effects(**dict.fromkeys(names, True))
-        settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
+        settings = CAMERA.settings(best, device, variant, effects=effects)
         return ar.GaussianRasterizer(settings)(**scene)[2]
 
     together = outputs(*looks)

@@ -7,6 +7,7 @@ import scenes
 import torch
 from marks import each_precision
 from scenes import Camera, ParallelCamera
+from threads import same_on_threads
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import filters
@@ -17,9 +18,8 @@ F64 = torch.float64
 
 def camera(distance, size=(64, 48), tan=0.5):
     """Settings of a camera on the z axis that looks at the origin."""
-    base = Camera(image_width=size[0], image_height=size[1], tanfovx=tan, tanfovy=tan * size[1] / size[0],
-                  eye=(0, 0, -distance))  # fmt: skip
-    return base.settings(F64)
+    angles = {"tanfovx": tan, "tanfovy": tan * size[1] / size[0]}
+    return Camera(image_width=size[0], image_height=size[1], eye=(0, 0, -distance), **angles).settings(F64)
 
 
 def test_filter_is_the_finest_interval_of_the_cameras_that_see_a_point():
@@ -129,11 +129,7 @@ def test_values_and_gradients_are_those_of_the_formula(device, dtype, count, fla
 
 def test_threads_change_no_bit_of_a_filter():
     given = [t.float() for t in filter_inputs(20_000)[0]]
-    made = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        made.append(ar.apply_3d_filter(*given))
-    assert all(torch.equal(a, b) for other in made[1:] for a, b in zip(made[0], other))
+    same_on_threads(lambda: ar.apply_3d_filter(*given))
 
 
 def test_opcheck(device):
@@ -147,7 +143,7 @@ def test_opcheck(device):
 @pytest.mark.parametrize("wrong", [math.nan, -0.1])
 def test_a_gaussian_whose_filter_makes_no_sense_is_culled(wrong, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # for the file that debug leaves
-    scene = {name: v for name, v in scenes.random_scene(1, 20).items() if name != "means2D"}
+    scene = scenes.without(scenes.random_scene(1, 20), "means2D")
     width = torch.full((20,), 0.05, dtype=F64)
     width[3] = wrong
     settings = scenes.Camera().settings(F64, "cpu")
@@ -340,10 +336,7 @@ def test_a_baked_dilation_shows_with_moment_what_point_showed():
     scene["scales"] = scene["scales"] * 0.2
 
     def picture(footprint, gaussians, scale=1):
-        view = camera(8)
-        settings = view._replace(
-            image_width=view.image_width // scale, image_height=view.image_height // scale, footprint=footprint
-        )
+        settings = camera(8)._replace(image_width=64 // scale, image_height=48 // scale, footprint=footprint)
         return ar.GaussianRasterizer(settings)(**gaussians)[0]
 
     shown = picture("point", scene)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from marks import each_precision, needs_cuda
 from processes import run_python
+from threads import assert_identical, same_on_threads
 from torch.nn import functional
 
 import analytic_rasterizer as ar
@@ -257,13 +258,12 @@ def test_nothing_is_kept_without_a_gradient(device):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_thread_count_changes_no_bit(dtype):
     image, target = (t.to(dtype) for t in pair(3, 300, 200))
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
+
+    def results():
         of_loss = value_and_gradient(lambda x: losses.l1_ssim(x, target), image)
-        results.append([*of_loss, losses.ssim(image, target, "none")])
-    for others in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], others))
+        return *of_loss, losses.ssim(image, target, "none")
+
+    same_on_threads(results)
 
 
 def test_repeated_runs_are_identical(device):
@@ -271,8 +271,7 @@ def test_repeated_runs_are_identical(device):
     image, target = (t.to(device, torch.float32) for t in pair(3, 300, 200))
     first = value_and_gradient(lambda x: losses.l1_ssim(x, target), image)
     for _ in range(5):
-        again = value_and_gradient(lambda x: losses.l1_ssim(x, target), image)
-        assert all(torch.equal(a, b) for a, b in zip(first, again))
+        assert_identical(first, value_and_gradient(lambda x: losses.l1_ssim(x, target), image))
 
 
 @pytest.mark.parametrize("name", ["image", "target"])
@@ -294,8 +293,8 @@ def test_nan_is_not_hidden(device, name):
 # --- errors --------------------------------------------------------------------------------------
 
 
-def image(*shape, dtype=torch.float32):
-    return torch.zeros(*(shape or (3, 8, 9)), dtype=dtype)
+def image(*shape):
+    return torch.zeros(*(shape or (3, 8, 9)))
 
 
 @pytest.mark.parametrize("function", [losses.l1_ssim, losses.ssim, lambda x, y: losses.ssim(x, y, "none")])
@@ -304,18 +303,10 @@ def image(*shape, dtype=torch.float32):
     [
         (([1.0], image()), TypeError, "image must be a tensor, got list"),
         ((image(), None), TypeError, "target must be a tensor, got NoneType"),
-        ((image(dtype=torch.float16), image()), TypeError, "image must have dtype float32 or float64, got Half"),
-        ((image(dtype=torch.uint8), image()), TypeError, "image must have dtype float32 or float64, got Byte"),
-        (
-            (image(), image(dtype=torch.float64)),
-            TypeError,
-            "target must have the dtype of image, Float, or uint8, got D",
-        ),
-        (
-            (image(), image(dtype=torch.int32)),
-            TypeError,
-            "target must have the dtype of image, Float, or uint8, got Int",
-        ),
+        ((image().half(), image()), TypeError, "image must have dtype float32 or float64, got Half"),
+        ((image().byte(), image()), TypeError, "image must have dtype float32 or float64, got Byte"),
+        ((image(), image().double()), TypeError, "target must have the dtype of image, Float, or uint8, got D"),
+        ((image(), image().int()), TypeError, "target must have the dtype of image, Float, or uint8, got Int"),
         ((image(8, 9), image(8, 9)), ValueError, r"image must have shape \(C, H, W\) or \(B, C, H, W\), got \(8, 9\)"),
         ((image(1, 1, 1, 8, 9),) * 2, ValueError, "image must have shape"),
         ((image(), image(3, 8, 8)), ValueError, r"target must have shape that of image, \(3, 8, 9\), got \(3, 8, 8\)"),
@@ -330,15 +321,18 @@ def test_errors(function, arguments, error, message):
         function(*arguments)
 
 
-def test_errors_of_options():
-    with pytest.raises(ValueError, match=r"ssim_weight must be in \[0, 1\], got 1.5"):
-        losses.l1_ssim(image(), image(), 1.5)
-    with pytest.raises(ValueError, match=r"ssim_weight must be in \[0, 1\], got nan"):
-        losses.l1_ssim(image(), image(), float("nan"))
-    with pytest.raises(TypeError, match="ssim_weight must be a number, got str"):
-        losses.l1_ssim(image(), image(), "0.2")
-    with pytest.raises(ValueError, match=r"reduction must be one of .*, got 'sum'"):
-        losses.ssim(image(), image(), "sum")
+@pytest.mark.parametrize(
+    "function, option, error, message",
+    [
+        (losses.l1_ssim, 1.5, ValueError, r"ssim_weight must be in \[0, 1\], got 1.5"),
+        (losses.l1_ssim, float("nan"), ValueError, r"ssim_weight must be in \[0, 1\], got nan"),
+        (losses.l1_ssim, "0.2", TypeError, "ssim_weight must be a number, got str"),
+        (losses.ssim, "sum", ValueError, r"reduction must be one of .*, got 'sum'"),
+    ],
+)
+def test_errors_of_options(function, option, error, message):
+    with pytest.raises(error, match=message):
+        function(image(), image(), option)
 
 
 @needs_cuda
@@ -380,18 +374,16 @@ def test_opcheck(device, dtype):
 
 
 def test_adjoints_check_what_they_are_given():
-    x, y = image(), image()
-    op, partials = torch.ops.analytic_rasterizer.ssim_map_vjp, torch.zeros(3, 3, 8, 9)
-    with pytest.raises(ValueError, match="saved must be what the op saved"):
-        op([x], x, y, True, [partials[:2]], [True, False])
-    with pytest.raises(ValueError, match="saved must be what the op saved"):
-        op([x], x, y, True, [], [True, False])
-    with pytest.raises(ValueError, match="target has no gradient"):
-        op([x], x, y, True, [partials], [True, True])
-    with pytest.raises(ValueError, match="dL_dmap must have shape"):
-        op([x[:1]], x, y, True, [partials], [True, False])
-    with pytest.raises(ValueError, match="got none"):
-        op([None], x, y, True, [partials], [True, False])
+    x, partials, wanted = image(), torch.zeros(3, 3, 8, 9), [True, False]
+    for given, saved, wants, message in (
+        (x, [partials[:2]], wanted, "saved must be what the op saved"),
+        (x, [], wanted, "saved must be what the op saved"),
+        (x, [partials], [True, True], "target has no gradient"),
+        (x[:1], [partials], wanted, "dL_dmap must have shape"),
+        (None, [partials], wanted, "got none"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            torch.ops.analytic_rasterizer.ssim_map_vjp([given], x, image(), True, saved, wants)
 
 
 @needs_cuda

@@ -6,6 +6,7 @@ import io
 import pytest
 import torch
 from marks import needs_cuda, needs_newer_compiler
+from threads import same_on_threads
 from torch.optim import Adam
 
 import analytic_rasterizer as ar
@@ -285,11 +286,8 @@ def test_parameters_may_be_columns_of_one_matrix(device):
 
 
 def sparse_step(optimizer, seed):
-    parameters = parameters_of(optimizer)
-    for parameter, gradient in zip(parameters, draw([p.shape for p in parameters], seed)):
-        parameter.grad = gradient.to(parameter)
-    count = len(parameters[0])
-    optimizer.step(torch.arange(count, device=parameters[0].device) % 3 > 0, count)
+    first = parameters_of(optimizer)[0]
+    take_step(optimizer, seed, visibility=torch.arange(len(first), device=first.device) % 3 > 0, N=len(first))
 
 
 def densify(optimizer):
@@ -350,12 +348,7 @@ def test_an_expanded_parameter_is_refused():
 
 def test_thread_count_changes_no_bit():
     state = make_state([(30_000, 3), (70_001,), (5,)])
-    results = []
-    for threads in (1, 2, 7):
-        torch.set_num_threads(threads)
-        results.append(op_step(state))
-    for others in results[1:]:
-        assert_bits(results[0], others)
+    same_on_threads(lambda: [t for tensors in op_step(state) for t in tensors])
 
 
 @needs_cuda
@@ -392,9 +385,11 @@ def test_resuming_changes_no_bit(device):
     file = io.BytesIO()
     torch.save(whole.state_dict(), file)
     file.seek(0)
-    resumed = FusedAdam([{"params": [p.detach().clone().requires_grad_()]} for p in parameters_of(whole)])
+    resumed, translated, from_torch = (
+        kind([{"params": [p.detach().clone().requires_grad_()]} for p in parameters_of(whole)])
+        for kind in (FusedAdam, FusedAdam, Adam)
+    )
     resumed.load_state_dict(torch.load(file))
-    from_torch = Adam([{"params": [p.detach().clone().requires_grad_()]} for p in parameters_of(whole)])
     stored = copy.deepcopy(whole.state_dict())
     for state in stored["state"].values():
         state["step"] = torch.tensor(float(state["step"]))
@@ -402,7 +397,6 @@ def test_resuming_changes_no_bit(device):
     for group, ours in zip(groups, stored["param_groups"]):
         group |= ours
     from_torch.load_state_dict({"state": stored["state"], "param_groups": groups})
-    translated = FusedAdam([{"params": [p.detach().clone().requires_grad_()]} for p in parameters_of(whole)])
     translated.load_state_dict(from_torch.state_dict())
     for step in range(3, 5):
         for optimizer in (whole, resumed, translated):
@@ -485,6 +479,11 @@ def test_the_op_changes_no_parameter_under_autograd():
         adam_(*state, [0.1], [1], 0.9, 0.999, 1e-8)
 
 
+def good_arguments(device="cpu"):
+    state = dict(zip(LISTS, make_state([(4, 1), (4, 3)], device=device)))
+    return state | {"rates": [0.1, 0.1], "steps": [1, 1], "beta1": 0.9, "beta2": 0.999, "eps": 1e-8}
+
+
 def shared(lists):
     """The first moments are the second ones."""
     lists["exp_avgs"][1] = lists["exp_avg_sqs"][1]
@@ -504,6 +503,13 @@ def replaced(name, k, tensor):
     return lambda arguments: arguments[name].__setitem__(k, tensor)
 
 
+def given(**options):
+    return lambda arguments: arguments.update(options)
+
+
+DOUBLE, TURNED, SHARED = torch.ones(4, 3).double(), torch.ones(3, 4), torch.ones(6).as_strided((4, 3), (1, 1))
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [
@@ -512,46 +518,33 @@ def replaced(name, k, tensor):
         (replaced("rates", 1, float("nan")), ValueError, r"rates\[1\] must be finite and not negative, got nan"),
         (replaced("rates", 1, -1.0), ValueError, r"rates\[1\] must be finite and not negative, got -1"),
         (replaced("steps", 1, 0), ValueError, r"steps\[1\] must be at least 1, got 0"),
-        (lambda a: a.update(beta1=1.0), ValueError, r"beta1 must be in \[0, 1\), got 1"),
-        (lambda a: a.update(beta2=-0.1), ValueError, r"beta2 must be in \[0, 1\), got -0.1"),
-        (lambda a: a.update(eps=float("inf")), ValueError, "eps must be finite and not negative, got inf"),
-        (lambda a: a.update(heads=[1, 1]), ValueError, "head_rates must have as many members as params, 2, got 0"),
-        (
-            lambda a: a.update(heads=[1, 4], head_rates=[0.1, 0.1]),
-            ValueError,
-            r"heads\[1\] must be 0 to the size of a row",
-        ),
-        (lambda a: a.update(heads=[0, 1], head_rates=[0.1, -1.0]), ValueError, r"head_rates\[1\] must be finite"),
+        (given(beta1=1.0), ValueError, r"beta1 must be in \[0, 1\), got 1"),
+        (given(beta2=-0.1), ValueError, r"beta2 must be in \[0, 1\), got -0.1"),
+        (given(eps=float("inf")), ValueError, "eps must be finite and not negative, got inf"),
+        (given(heads=[1, 1]), ValueError, "head_rates must have as many members as params, 2, got 0"),
+        (given(heads=[1, 4], head_rates=[0.1, 0.1]), ValueError, r"heads\[1\] must be 0 to the size of a row"),
+        (given(heads=[0, 1], head_rates=[0.1, -1.0]), ValueError, r"head_rates\[1\] must be finite"),
         (replaced("params", 0, torch.ones(4, 1).half()), TypeError, "params must have dtype float32 or float64"),
-        (
-            replaced("params", 1, torch.ones(4, 3).double()),
-            TypeError,
-            r"params\[1\] must have the dtype of params\[0\]",
-        ),
-        (replaced("exp_avgs", 1, torch.ones(4, 3).double()), TypeError, r"exp_avgs\[1\] must have the dtype of params"),
-        (
-            replaced("grads", 1, torch.ones(3, 4)),
-            ValueError,
-            r"grads\[1\] must have the shape .* \(4, 3\), got \(3, 4\)",
-        ),
+        (replaced("params", 1, DOUBLE), TypeError, r"params\[1\] must have the dtype of params\[0\]"),
+        (replaced("exp_avgs", 1, DOUBLE), TypeError, r"exp_avgs\[1\] must have the dtype of params"),
+        (replaced("grads", 1, TURNED), ValueError, r"grads\[1\] must have the shape .* \(4, 3\), got \(3, 4\)"),
         (replaced("params", 1, torch.ones(3).expand(4, 3)), ValueError, r"params\[1\] must have memory of its own"),
         (
-            replaced("exp_avg_sqs", 1, torch.ones(6).as_strided((4, 3), (1, 1))),
+            replaced("exp_avg_sqs", 1, SHARED),
             ValueError,
             r"exp_avg_sqs\[1\] must have memory .* \(4, 3\) with strides \(1, 1\)",
         ),
         (half_of_a_parameter, ValueError, "must not share memory"),
-        (lambda a: a.update(rows=torch.ones(4)), TypeError, "rows must have dtype bool or uint8, got Float"),
-        (lambda a: a.update(rows=torch.ones(3).bool()), ValueError, r"params\[0\] must have a row for each of rows, 3"),
-        (lambda a: a.update(rows=torch.ones(4, 1).bool()), ValueError, r"rows must have shape \(P,\), got \(4, 1\)"),
+        (given(rows=torch.ones(4)), TypeError, "rows must have dtype bool or uint8, got Float"),
+        (given(rows=torch.ones(3).bool()), ValueError, r"params\[0\] must have a row for each of rows, 3"),
+        (given(rows=torch.ones(4, 1).bool()), ValueError, r"rows must have shape \(P,\), got \(4, 1\)"),
         (shared, ValueError, "must not share memory"),
         (in_the_gradient, ValueError, "must not share memory"),
         (lambda a: [a[name].append(a[name][0]) for name in (*LISTS, "rates", "steps")], ValueError, "must not share"),
     ],
 )
 def test_errors_are_raised_before_anything_is_touched(change, error, message):
-    arguments = dict(zip(LISTS, make_state([(4, 1), (4, 3)])))
-    arguments |= {"rates": [0.1, 0.1], "steps": [1, 1], "beta1": 0.9, "beta2": 0.999, "eps": 1e-8}
+    arguments = good_arguments()
     change(arguments)
     before = [[t.clone() for t in arguments[name]] for name in LISTS]
     with pytest.raises(error, match=message):
@@ -614,8 +607,7 @@ def test_opcheck(device, dtype):
 @needs_cuda
 @pytest.mark.parametrize("name, k", [("grads", 1), ("exp_avgs", 0), ("params", 1)])
 def test_cuda_tensors_beside_those_of_the_host(name, k):
-    arguments = dict(zip(LISTS, make_state([(4, 1), (4, 3)], device="cuda")))
-    arguments |= {"rates": [0.1, 0.1], "steps": [1, 1], "beta1": 0.9, "beta2": 0.999, "eps": 1e-8}
+    arguments = good_arguments("cuda")
     with pytest.raises(ValueError, match="rows must be on the device of params, got cpu"):
         adam_(**arguments, rows=torch.ones(4, dtype=torch.bool))
     arguments[name][k] = arguments[name][k].cpu()

@@ -16,7 +16,8 @@ import pytest
 import scenes
 import torch
 from hard_cases import Case
-from scenes import KINDS, RENDERED, Camera, name_of
+from marks import each_kind, every_footprint
+from scenes import Camera
 
 import analytic_rasterizer as ar
 
@@ -35,7 +36,6 @@ STARTS = {"isotropic": (0.15, 0.15), "needles": (0.6, 0.003), "sub-pixel": (0.06
 POINTS = (0, 5, 20, 40)
 
 each_start = pytest.mark.parametrize("kind", STARTS)
-each_variant = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 
 
 def start(kind):
@@ -81,8 +81,7 @@ class Problem:
     """The loss at each size, for one footprint, in one precision."""
 
     def __init__(self, variant, dtype=torch.float64, device="cpu"):
-        footprint, options = variant
-        settings = [camera.settings(dtype, device, footprint=footprint, **options) for camera in CAMERAS]
+        settings = [camera.settings(dtype, device, variant) for camera in CAMERAS]
         self.rasterizers = [ar.GaussianRasterizer(s) for s in settings]
         self.images = [image.to(device, dtype) for image in targets()]
 
@@ -139,7 +138,7 @@ def allow_for_the_determinant(report, scales):
 
 
 @each_start
-@each_variant
+@every_footprint
 def test_gradients_along_a_path(device, variant, kind):
     """The float32 image and gradients agree with float64's for the same numbers, within the tolerance that the
     condition of each point allows (hard_cases.py), Gaussian by Gaussian.
@@ -163,7 +162,7 @@ def test_gradients_along_a_path(device, variant, kind):
 
 
 @each_start
-@each_variant
+@every_footprint
 def test_a_step_against_the_gradient_descends(device, variant, kind):
     """From every point of the path some step, of the learning rates or of 2^-10 of them or between, lowers the float32
     loss by at least half of what the float32 gradient promises for it (Armijo's condition).
@@ -198,7 +197,7 @@ MOST_LEFT = 0.3
 
 
 @each_start
-@pytest.mark.parametrize("variant", KINDS, ids=name_of)
+@each_kind
 def test_adam_descends(device, variant, kind):
     """Everything stays finite over a whole float32 optimisation, and most of the loss goes."""
     problem = Problem(variant, torch.float32, device)

@@ -53,9 +53,8 @@ class Unwritten(TorchDispatchMode):
 
 def rasterize(device, variant, count, full):
     """Everything that rasterization returns, and gradients of its outputs one by one and together."""
-    footprint, options = variant
     effects = replace(EVERYTHING, camera_gradients=True, defocus=ar.Defocus(0.1, 2.0)) if full else EVERYTHING
-    settings = Camera().settings(torch.float32, device, footprint=footprint, effects=effects, **options)
+    settings = Camera().settings(torch.float32, device, variant, effects=effects)
     if full:
         settings = settings._replace(viewmatrix=settings.viewmatrix.clone().requires_grad_())
     scene = scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device)
@@ -73,8 +72,7 @@ def rasterize(device, variant, count, full):
 
 
 def stages(device, variant, count):
-    footprint, options = variant
-    settings = Camera().settings(torch.float32, device, footprint=footprint, **options)
+    settings = Camera().settings(torch.float32, device, variant)
     scene = scenes.leaves(scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device))
     del scene["means2D"]
     splats = ar.project([settings, settings], **scene)

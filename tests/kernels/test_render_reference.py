@@ -14,7 +14,8 @@ import pytest
 import reference
 import scenes
 import torch
-from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
+from marks import each_kind, each_path, every_footprint
+from scenes import KINDS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.render.arguments import camera_arguments, gaussian_arguments
@@ -24,18 +25,13 @@ GRADIENT_TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}  # of the larges
 # Rounding must not decide a comparison with a threshold: distance to it, relative.
 MARGIN = {torch.float64: 1e-10, torch.float32: 1e-3}
 
-every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 # On CUDA, sums of absolute values over many samples have kernels of their own.
 each_sum_of_absolute_values = pytest.mark.parametrize("variant", [*KINDS, ("box", {"samples": 16})], ids=name_of)
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 
 def render(camera, scene, variant):
     """(color, radii) of the library, on the scene's device and in its dtype."""
-    footprint, options = variant
-    settings = camera.settings(scene["means3D"].dtype, scene["means3D"].device, footprint=footprint, **options)
-    return ar.GaussianRasterizer(settings)(**scene)
+    return camera.render(scene, variant)
 
 
 def rasterize_op(settings, scene, **chosen):
@@ -70,10 +66,9 @@ def both_leaves(scene, dtype, device):
     return scenes.leaves(ours), scenes.leaves(scenes.cast(ours, torch.float64))
 
 
-def probe(camera, seed=99):
+def probe(camera):
     """Weights of the scalar loss whose gradient is compared."""
-    g = torch.Generator().manual_seed(seed)
-    return scenes.rand(g, 3, camera.image_height, camera.image_width, low=-1.0)
+    return scenes.probe(torch.zeros(3, camera.image_height, camera.image_width, dtype=torch.float64), seed=99)
 
 
 def clear_probe(camera, rendered, dtype):
@@ -202,9 +197,8 @@ def test_scale_modifier_acts_on_scales_only(device, best):
     difference = (by_modifier - render(Camera(), scaled, ("mip", {}))[0]).abs().max()
     assert difference < (1e-12 if best == torch.float64 else IMAGE_TOLERANCE[best])
     fixed = scenes.cast(scenes.with_precomputed(scenes.random_scene(31)), best, device)
-    assert torch.equal(
-        render(Camera(scale_modifier=1.7), fixed, ("mip", {}))[0], render(Camera(), fixed, ("mip", {}))[0]
-    )
+    with_modifier, plain = (render(Camera(scale_modifier=s), fixed, ("mip", {}))[0] for s in (1.7, 1.0))
+    assert torch.equal(with_modifier, plain)
 
 
 @each_path
@@ -261,43 +255,29 @@ def test_extreme_quaternions_float32(device, length):
     assert torch.isfinite(ours["scales"].grad).all()
 
 
+@pytest.mark.parametrize("columns, means2d_z", [(4, None), (3, "sum_abs"), (3, "sum_norm")])
 @each_sum_of_absolute_values
-def test_absolute_gradients(device, best, variant):
-    """means2D (P, 4): columns 0:2 as ever, 2:4 the sum over pixels of |gx|, |gy|."""
-    camera = CAMERA
-    scene = dict(hard_scene(13), means2D=torch.zeros(44, 4).double())
+def test_sums_over_pixels_beside_gradients_of_means2d(device, best, variant, columns, means2d_z):
+    """means2D (P, 4): columns 0:2 as ever, 2:4 the sum over pixels of |gx|, |gy|. means2D (P, 3): column 2 the sum over
+    pixels of |gx| + |gy|, or of the length of (gx, gy)."""
+    scene = dict(hard_scene(13), means2D=torch.zeros(44, columns).double())
     ours, theirs = both_leaves(scene, best, device)
-    expected = render_reference(camera, theirs, variant, best, keep_offsets=True)
-    loss = clear_probe(camera, expected, best)
-    (render(camera, ours, variant)[0] * loss.to(device, best)).sum().backward()
-    (expected.color * loss).sum().backward()
-    absolute = reference.absolute_gradient(expected, 44, camera.settings())
-    actual = ours["means2D"].grad.cpu()
-    assert relative_error(actual[:, :2], theirs["means2D"].grad[:, :2]) < GRADIENT_TOLERANCE[best]
-    assert relative_error(actual[:, 2:], absolute) < GRADIENT_TOLERANCE[best]
-
-
-@pytest.mark.parametrize("means2d_z", ["sum_abs", "sum_norm"])
-@each_sum_of_absolute_values
-def test_third_column_of_means2d(device, best, variant, means2d_z):
-    """means2D (P, 3): column 2 the sum over pixels of |gx| + |gy|, or of the length of (gx, gy)."""
-    camera = CAMERA
-    scene = dict(hard_scene(13), means2D=torch.zeros(44, 3).double())
-    ours, theirs = both_leaves(scene, best, device)
-    expected = render_reference(camera, theirs, variant, best, keep_offsets=True)
-    loss = clear_probe(camera, expected, best)
-    footprint, options = variant
-    settings = camera.settings(best, device, footprint=footprint, **options)
-    color = rasterize_op(settings, ours, means2d_z=means2d_z)[0]
+    expected = render_reference(CAMERA, theirs, variant, best, keep_offsets=True)
+    loss = clear_probe(CAMERA, expected, best)
+    if means2d_z is None:
+        color, _ = render(CAMERA, ours, variant)
+    else:
+        color = rasterize_op(CAMERA.settings(best, device, variant), ours, means2d_z=means2d_z)[0]
     (color * loss.to(device, best)).sum().backward()
     (expected.color * loss).sum().backward()
     actual = ours["means2D"].grad.cpu()
     assert relative_error(actual[:, :2], theirs["means2D"].grad[:, :2]) < GRADIENT_TOLERANCE[best]
-    if means2d_z == "sum_abs":
-        column = reference.absolute_gradient(expected, 44, camera.settings()).sum(1)
+    if means2d_z == "sum_norm":
+        sums = reference.norm_gradient(expected, 44, CAMERA.settings())[:, None]
     else:
-        column = reference.norm_gradient(expected, 44, camera.settings())
-    assert relative_error(actual[:, 2], column) < GRADIENT_TOLERANCE[best]
+        sums = reference.absolute_gradient(expected, 44, CAMERA.settings())
+        sums = sums if columns == 4 else sums.sum(1, keepdim=True)
+    assert relative_error(actual[:, 2:], sums) < GRADIENT_TOLERANCE[best]
 
 
 @pytest.mark.parametrize("means2d_z", ["zero", "sum_abs", "sum_norm"])
@@ -342,13 +322,7 @@ def test_means2d_forms_agree(device, best, variant):
 def test_cap_has_zero_gradient(device, best):
     """One splat with opacity 1 over its centre pixel: alpha = 0.99 whatever the input does."""
     camera = Camera(image_height=1, image_width=1).facing_z()
-    scene = scenes.splat_scene(
-        camera,
-        torch.zeros(1, 2).double(),
-        torch.tensor([[25.0, 3.0, 16.0]]).double(),
-        torch.ones(1).double(),
-        torch.tensor([2.0]).double(),
-    )
+    scene = scenes.splat_scene(camera, [[0.0, 0.0]], [25.0, 3.0, 16.0], [1.0], [2.0])
     ours = scenes.leaves(scenes.cast(scene, best, device))
     color, _ = render(camera, ours, ("point", {}))
     cap = torch.tensor(0.99, dtype=best, device=device)
@@ -481,15 +455,7 @@ def test_depth_order_not_input_order(device, best, variant):
 
 def test_equal_depths_keep_input_order(device, best):
     camera = Camera(image_height=1, image_width=1).facing_z()
-    colors = torch.eye(3).double()
-    scene = scenes.splat_scene(
-        camera,
-        torch.zeros(3, 2).double(),
-        torch.tensor([[25.0, 0, 25.0]]).double().expand(3, 3),
-        torch.tensor([0.5, 0.5, 0.5]).double(),
-        torch.tensor([2.0, 2.0, 2.0]).double(),
-        colors,
-    )
+    scene = scenes.splat_scene(camera, [[0.0, 0.0]] * 3, [25.0, 0, 25.0], [0.5] * 3, [2.0] * 3, torch.eye(3).double())
     color, _ = render(camera, scenes.cast(scene, best, device), ("point", {}))
     expected = torch.tensor([0.5, 0.25, 0.125]).double()
     assert (color[:, 0, 0].cpu() - expected).abs().max() < 4.5 * torch.finfo(best).eps
@@ -593,23 +559,12 @@ def test_needles_float32(device, variant, ratio):
 @pytest.mark.parametrize("variant", [("analytic", {}), ("box", {"samples": 4})], ids=name_of)
 def test_trained_scene(plant, variant):
     """1500 Gaussians of a trained plant, 48x27 px: real scales, opacities and SH, float64."""
-    inputs, views = plant
-    view = views[0]
+    inputs, (view, *_) = plant
     g = torch.Generator().manual_seed(0)
     chosen = torch.randperm(len(inputs["means3D"]), generator=g)[:1500]
     scene = {name: value[chosen].double() for name, value in inputs.items()}
     scene["scales"] = scene["scales"] * 4  # fewer Gaussians, so larger ones
-    world_to_camera = torch.tensor(view["w2c"], dtype=torch.float64).reshape(4, 4)
-    tangent = [view["width"] / (2 * view["fx"]), view["height"] / (2 * view["fy"])]
-    camera = Camera(image_width=48, image_height=27, tanfovx=tangent[0], tanfovy=tangent[1])
-    fields = camera.fields() | {
-        "sh_degree": 3,
-        "viewmatrix": world_to_camera.T.contiguous(),
-        "projmatrix": (camera.perspective() @ world_to_camera).T.contiguous(),
-        "campos": torch.linalg.inv(world_to_camera)[:3, 3].contiguous(),
-    }
-    footprint, options = variant
-    settings = ar.GaussianRasterizationSettings(**fields, footprint=footprint, **options)
+    settings = scenes.of_view(view, variant, size=(48, 27))
     color, _ = ar.GaussianRasterizer(settings)(**scene)
     expected = reference_of(settings, scene, variant)
     clear = expected.pixel_margin > 1e-10

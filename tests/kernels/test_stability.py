@@ -18,16 +18,13 @@ from hard_cases import CASES, EPS
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from marks import each_precision
+from marks import each_kind, each_path, each_precision, every_footprint
 from places import ROOT
-from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, VARIANTS, Camera, name_of
+from scenes import REFERENCE_FOOTPRINTS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 
 DOCS = ROOT / "docs"
-every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 STACKS = ("stack_opaque", "stack_faint", "stack_mixed")
 # A case of another name would not be looked at more closely, and no test would say so.
 assert {case.name for case in CASES}.issuperset(STACKS)

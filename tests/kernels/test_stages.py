@@ -6,25 +6,22 @@ import weakref
 import pytest
 import scenes
 import torch
-from marks import each_precision
-from scenes import Camera, name_of
+from gsplat_calls import assert_gradients_close, gradients
+from marks import each_kind, each_precision
+from scenes import KINDS, Camera, name_of
 from weights import weighted_sums, weights
 
 import analytic_rasterizer as ar
 
 CAMERA = Camera(image_width=27, image_height=21, bg=(0.1, 0.3, 0.2))
-RENDERED = scenes.KINDS
 
 
 def scene_of(dtype, device, seed=3, count=30, degree=1):
-    scene = scenes.cast(scenes.random_scene(seed, count, degree), dtype, device)
-    return {name: value for name, value in scene.items() if name != "means2D"}
+    return scenes.without(scenes.cast(scenes.random_scene(seed, count, degree), dtype, device), "means2D")
 
 
 def settings_of(dtype, device, variant=("box", {"samples": 4}), camera=CAMERA, **more):
-    footprint, options = variant
-    settings = dataclasses.replace(camera, sh_degree=1).settings(dtype, device, footprint=footprint, **options)
-    return settings._replace(**more) if more else settings
+    return dataclasses.replace(camera, sh_degree=1).settings(dtype, device, variant)._replace(**more)
 
 
 def tolerances(dtype):
@@ -32,14 +29,8 @@ def tolerances(dtype):
     return (1e-12, 1e-9) if dtype == torch.float64 else (2e-6, 2e-3)
 
 
-def assert_gradients_close(actual, expected, dtype):
-    for name in expected:
-        error = (actual[name] - expected[name]).norm() / expected[name].norm().clamp_min(1e-30)
-        assert error <= tolerances(dtype)[1], (name, error.item())
-
-
 @each_precision
-@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@each_kind
 def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
     settings = settings_of(dtype, device, variant)
     scene, again = (scenes.leaves(scene_of(dtype, device)) for _ in range(2))
@@ -51,9 +42,7 @@ def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
     assert torch.equal(radii[splats.gaussian_ids.long()], splats.radii) and len(splats.radii) == (radii > 0).sum()
 
     g = weights(color.shape, dtype, device)
-    expected = dict(zip(scene, torch.autograd.grad((color * g).sum(), list(scene.values()))))
-    actual = dict(zip(again, torch.autograd.grad((image[0] * g).sum(), list(again.values()))))
-    assert_gradients_close(actual, expected, dtype)
+    assert_gradients_close(gradients((image[0] * g).sum(), again), gradients((color * g).sum(), scene), dtype)
 
 
 @each_precision
@@ -65,7 +54,7 @@ def test_several_cameras_are_each_of_them(device, dtype):
     assert splats.cameras == 3 and splats.row_splits[-1] == len(splats.means2d)
     image, alpha = ar.blend(splats, ar.list_tiles(splats))
     g = weights(image.shape, dtype, device)
-    together = dict(zip(scene, torch.autograd.grad((image * g).sum(), list(scene.values()))))
+    together = gradients((image * g).sum(), scene)
     total = {name: torch.zeros_like(value) for name, value in scene.items()}
     for c, of_camera in enumerate(settings):
         alone = ar.project(of_camera, **scene)
@@ -74,7 +63,7 @@ def test_several_cameras_are_each_of_them(device, dtype):
         assert torch.equal(splats.gaussian_ids[rows], alone.gaussian_ids)
         own, own_alpha = ar.blend(alone, ar.list_tiles(alone))
         assert torch.equal(image[c], own[0]) and torch.equal(alpha[c], own_alpha[0])
-        for name, grad in zip(scene, torch.autograd.grad((own[0] * g[c]).sum(), list(scene.values()))):
+        for name, grad in gradients((own[0] * g[c]).sum(), scene).items():
             total[name] += grad
     assert_gradients_close(together, total, dtype)
 
@@ -121,7 +110,7 @@ def test_channels_are_blended_like_colours(device, dtype, channels):
 
     leaves = scenes.leaves(scene | {"colors_precomp": features})
     color, radii = ar.GaussianRasterizer(settings._replace(bg=background))(means2D=None, **leaves)
-    actual = dict(zip(leaves, torch.autograd.grad((color * g).sum(), list(leaves.values()))))
+    actual = gradients((color * g).sum(), leaves)
 
     total = {name: torch.zeros_like(value) for name, value in leaves.items()}
     for first in range(0, channels, 3):
@@ -132,7 +121,7 @@ def test_channels_are_blended_like_colours(device, dtype, channels):
         own, own_radii = ar.GaussianRasterizer(of_three)(means2D=None, **three)
         assert torch.equal(own_radii, radii)
         assert (own[:width] - color[part]).abs().max() <= tolerances(dtype)[0]
-        for name, grad in zip(three, torch.autograd.grad((own[:width] * g[part]).sum(), list(three.values()))):
+        for name, grad in gradients((own[:width] * g[part]).sum(), three).items():
             if name == "colors_precomp":
                 total[name][:, part] = grad[:, :width]
             else:
@@ -176,19 +165,18 @@ def test_depth_is_a_channel(device, dtype, channels):
     color, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **leaves)
     planes = torch.cat([color, outputs.depth, outputs.inverse_depth, outputs.alpha])
     g = weights(planes.shape, dtype, device)
-    actual = dict(zip(leaves, torch.autograd.grad((planes * g).sum(), list(leaves.values()))))
+    actual = gradients((planes * g).sum(), leaves)
 
     plain = settings_of(dtype, device)
     features = again.get("colors_precomp")
-    splats = ar.project(plain, **{k: v for k, v in again.items() if k != "colors_precomp"})
+    splats = ar.project(plain, **scenes.without(again, "colors_precomp"))
     features = splats.colors if features is None else features[splats.gaussian_ids.long()]
     table = torch.cat([features, splats.depths[:, None], 1 / splats.depths[:, None]], 1)
     background = torch.cat([settings.bg, settings.bg.new_zeros(2)])
     image, alpha = ar.blend(splats, ar.list_tiles(splats), table, background)
     expected_planes = torch.cat([image[0], alpha[0]])
     assert (planes - expected_planes).abs().max() <= 5 * tolerances(dtype)[0]
-    expected = dict(zip(again, torch.autograd.grad((expected_planes * g).sum(), list(again.values()))))
-    assert_gradients_close(actual, expected, dtype)
+    assert_gradients_close(actual, gradients((expected_planes * g).sum(), again), dtype)
 
 
 @each_precision
@@ -196,11 +184,9 @@ def test_depth_is_a_channel(device, dtype, channels):
 def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
     """means2D (P, 4): sums over pixels of |dL/dmean|, where a pixel's gradient is that of all its channels."""
     camera = Camera(image_width=6, image_height=5)
-    settings = camera.settings(dtype, device, footprint="box", samples=4)._replace(
-        bg=torch.zeros(channels).to(device, dtype)
-    )
-    scene = scenes.cast(scenes.random_scene(4, 8), dtype, device)
-    del scene["shs"], scene["means2D"]
+    background = torch.zeros(channels, dtype=dtype, device=device)
+    settings = camera.settings(dtype, device, footprint="box", samples=4)._replace(bg=background)
+    scene = scenes.without(scenes.cast(scenes.random_scene(4, 8), dtype, device), "shs", "means2D")
     scene["colors_precomp"] = weights((8, channels), dtype, device)
     g = weights((channels, 5, 6), dtype, device, seed=1) - 0.5
     means2D = torch.zeros(8, 4, dtype=dtype, device=device, requires_grad=True)
@@ -213,22 +199,16 @@ def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
             color, _ = ar.GaussianRasterizer(settings)(means2D=single, **scene)
             (color[:, y, x] * g[:, y, x]).sum().backward()
             expected += single.grad[:, :2].abs()
-    torch.testing.assert_close(
-        means2D.grad[:, 2:], expected, rtol=tolerances(dtype)[1], atol=1e-5 * expected.max().item()
-    )
+    close = {"rtol": tolerances(dtype)[1], "atol": 1e-5 * expected.max().item()}
+    torch.testing.assert_close(means2D.grad[:, 2:], expected, **close)
 
-    splats = ar.project(settings, **{k: v for k, v in scene.items() if k != "colors_precomp"})
+    splats = ar.project(settings, **scenes.without(scene, "colors_precomp"))
     absolute = torch.zeros_like(splats.means2d, requires_grad=True)
     features = scene["colors_precomp"][splats.gaussian_ids.long()]
     image, _ = ar.blend(splats, ar.list_tiles(splats), features, means2d_abs=absolute)
     (image[0] * g).sum().backward()
     half = torch.tensor([3.0, 2.5], dtype=dtype, device=device)
-    torch.testing.assert_close(
-        absolute.grad * half,
-        expected[splats.gaussian_ids.long()],
-        rtol=tolerances(dtype)[1],
-        atol=1e-5 * expected.max().item(),
-    )
+    torch.testing.assert_close(absolute.grad * half, expected[splats.gaussian_ids.long()], **close)
 
 
 @pytest.mark.parametrize("variant", [("moment", {"samples": 4}), ("moment", {"samples": 16})], ids=name_of)
@@ -236,9 +216,9 @@ def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
 def test_three_channels_in_rows_are_as_in_splats(device, dtype, variant):
     """Lists are so long that kernels cut them into segments; rows of three channels have other sums than colours."""
     camera = Camera(image_width=20, image_height=15)
-    settings = dataclasses.replace(camera, sh_degree=1).settings(dtype, device, footprint=variant[0], **variant[1])
+    settings = settings_of(dtype, device, variant, camera)
     scene = scenes.random_scene(5, 3000, degree=1, opacity=(0.004, 0.05), spread=0.3)
-    scene = scenes.cast({name: value for name, value in scene.items() if name != "means2D"}, dtype, device)
+    scene = scenes.cast(scenes.without(scene, "means2D"), dtype, device)
     g = weights((3, 15, 20), dtype, device, seed=2) - 0.5
     grads = []
     for in_rows in (False, True):
@@ -299,7 +279,7 @@ def test_gradcheck_of_project(precomputed):
     assert torch.autograd.gradcheck(rows, tuple(leaves.values()))
 
 
-@pytest.mark.parametrize("variant", [v for v in RENDERED if v[0] not in ("analytic", "erf")], ids=name_of)
+@pytest.mark.parametrize("variant", [v for v in KINDS if v[0] not in ("analytic", "erf")], ids=name_of)
 def test_gradcheck_of_blend(variant):
     """`analytic` and `erf` hold the pixel's frame while they differentiate: their gradient is not the formula's."""
     settings = settings_of(torch.float64, "cpu", variant)
@@ -346,15 +326,13 @@ def test_a_batch_is_split_into_its_cameras(device):
     for camera, splats in zip(settings, batch.split()):
         alone = ar.project(camera, **leaves)
         for name, value in vars(alone).items():
-            assert (
-                torch.equal(getattr(splats, name), value) if torch.is_tensor(value) else getattr(splats, name) == value
-            )
-        got, expected = (
-            torch.autograd.grad(s.means2d.sum(), leaves["means3D"], retain_graph=True) for s in (splats, alone)
-        )
-        assert torch.equal(*got, *expected) and expected[0].abs().max() > 0
+            found = getattr(splats, name)
+            assert torch.equal(found, value) if torch.is_tensor(value) else found == value
+        sums = (s.means2d.sum() for s in (splats, alone))
+        got, expected = (torch.autograd.grad(total, leaves["means3D"], retain_graph=True)[0] for total in sums)
+        assert torch.equal(got, expected) and expected.abs().max() > 0
     assert alone.split() == [alone]
-    bare = {name: value for name, value in leaves.items() if name != "shs"}
+    bare = scenes.without(leaves, "shs")
     assert [s.colors.shape for s in ar.project(settings, **bare).split()] == [(0, 3)] * 2
 
 
@@ -372,16 +350,15 @@ def test_gradients_of_cameras_are_added_up_in_blocks(device):
     leaves = scenes.leaves({name: value.to(device) for name, value in scene.items()})
     settings = [settings_of(torch.float32, device, camera=dataclasses.replace(CAMERA, eye=(x, 0, -4))) for x in (0, 1)]
 
-    def gradients(cameras):
+    def gradients_of(cameras):
         splats = ar.project(cameras, **leaves)
         rows = [splats.means2d, splats.cov2d, splats.opacities, splats.colors]
         ids = splats.gaussian_ids.float() / count  # rows of a Gaussian count differently from those of another
-        return torch.autograd.grad(
-            sum((t.flatten(1) if t.dim() > 1 else t[:, None]).sum(1) @ ids for t in rows), list(leaves.values())
-        )
+        total = sum((t.flatten(1) if t.dim() > 1 else t[:, None]).sum(1) @ ids for t in rows)
+        return gradients(total, leaves).values()
 
-    parts = [gradients([camera]) for camera in settings]
-    for both, first, second in zip(gradients(settings), *parts):
+    parts = [gradients_of([camera]) for camera in settings]
+    for both, first, second in zip(gradients_of(settings), *parts):
         assert torch.equal(both, first + second) and first.abs().max() > 0
 
 
@@ -473,11 +450,8 @@ def test_what_is_no_tensor_and_no_camera_is_named():
 
 @pytest.mark.parametrize("op", ["project", "count_rows"])
 def test_a_number_in_place_of_means_is_named(op):
-    gaussians, cameras = ar.stages.project_arguments(
-        [settings_of(torch.float32, "cpu")],
-        **scene_of(torch.float32, "cpu"),
-        **dict.fromkeys(("colors_precomp", "cov3D_precomp")),
-    )
+    settings, scene = settings_of(torch.float32, "cpu"), scene_of(torch.float32, "cpu")
+    gaussians, cameras = ar.stages.project_arguments([settings], **scene, colors_precomp=None, cov3D_precomp=None)
     gaussians["means3D"] = torch.tensor(1.0)
     with pytest.raises(ValueError, match=r"means3D must have shape \(P, 3\)"):
         getattr(torch.ops.analytic_rasterizer, op)(**gaussians, **cameras)

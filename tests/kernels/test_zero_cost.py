@@ -17,13 +17,11 @@ from typing import NamedTuple
 import pytest
 import scenes
 import torch
-from marks import each_precision, needs_cuda
-from scenes import PATHS, Camera, name_of
+from marks import each_path, each_precision, needs_cuda
+from scenes import PATHS, Camera
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
-
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 # --- what the plain path calls, launches and allocates -----------------------------------------------
 
@@ -47,8 +45,7 @@ class Cost(NamedTuple):
 
 def frame(variant, pass_, device, effects=None):
     """A function that renders the fixed scene, all of whose inputs are there."""
-    footprint, options = variant
-    settings = SMALL.settings(torch.float32, device, footprint=footprint, effects=effects, **options)
+    settings = SMALL.settings(torch.float32, device, variant, effects=effects)
     scene = scenes.cast(scenes.random_scene(11, GAUSSIANS, degree=1), torch.float32, device)
     rasterizer = ar.GaussianRasterizer(settings)
     if pass_ == "inference":
@@ -248,8 +245,7 @@ def clamped(scene):
 
 def render(scene, variant, effects, dtype, device, loss=("color",)):
     """Everything that comes of it by name; with gradients by the Gaussians of a loss on the images named, if any."""
-    footprint, options = variant
-    settings = CAMERA.settings(dtype, device, footprint=footprint, effects=effects, **options)
+    settings = CAMERA.settings(dtype, device, variant, effects=effects)
     if effects is not None and effects.camera_gradients:
         leaves = {
             name: getattr(settings, name).clone().requires_grad_() for name in ("viewmatrix", "projmatrix", "campos")
@@ -347,11 +343,10 @@ def test_a_band_of_zeros_changes_nothing_else(variant, device, dtype):
     """Harmonics of degree 4 that are zero, used or left out."""
     scene = scenes.random_scene(31, COUNT, degree=4)
     scene["shs"][:, 16:] = 0
-    footprint, options = variant
     results = []
     for degree in (3, 4):
         inputs = scenes.leaves(scenes.cast(scene, dtype, device))
-        settings = CAMERA.settings(dtype, device, footprint=footprint, effects=ar.Effects(sh_degree=degree), **options)
+        settings = CAMERA.settings(dtype, device, variant, effects=ar.Effects(sh_degree=degree))
         color, radii = ar.GaussianRasterizer(settings._replace(sh_degree=4))(**inputs)
         color.square().sum().backward()
         grads = {name: leaf.grad for name, leaf in inputs.items()}

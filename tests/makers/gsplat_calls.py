@@ -3,6 +3,7 @@
 import scenes
 import torch
 from scenes import Camera
+from weights import weights
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.dialects.gsplat import rasterization
@@ -22,17 +23,26 @@ def gradient_tolerance(dtype):
     return 1e-9 if dtype == torch.float64 else 2e-3
 
 
+def as_gsplat_has_it(scene):
+    """Inputs of our rasterizer by gsplat's names, but for colours."""
+    names = {"means": "means3D", "quats": "rotations", "scales": "scales"}
+    return {ours: scene[name] for ours, name in names.items()} | {"opacities": scene["opacities"][:, 0].contiguous()}
+
+
+def smooth_call(channels):
+    """Scene and cameras of a small call for gradcheck: no alpha is near a threshold."""
+    cameras = cameras_of(torch.float64, "cpu")
+    cameras["Ks"][:, :2] *= 0.2
+    colors = weights((6, channels), torch.float64, "cpu")
+    return as_gsplat_has_it(scenes.smooth_scene(5)) | {"colors": colors} | cameras
+
+
 def scene_of(dtype, device, degree=0, count=40, seed=1):
     """In float64 any scene; in float32 one without an alpha so near to a threshold that rounding decides."""
     make = scenes.random_scene if dtype == torch.float64 else scenes.smooth_scene
     scene = scenes.cast(make(seed, count if dtype == torch.float64 else 6, degree), dtype, device)
-    return {
-        "means": scene["means3D"],
-        "quats": scene["rotations"],
-        "scales": scene["scales"],
-        "opacities": scene["opacities"][:, 0].contiguous(),
-        "colors": scene["shs"] if degree else scene["shs"][:, 0].abs().contiguous(),
-    }
+    colors = scene["shs"] if degree else scene["shs"][:, 0].abs().contiguous()
+    return as_gsplat_has_it(scene) | {"colors": colors}
 
 
 def cameras_of(dtype, device, count=2):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from scenes import KINDS, PATHS, RENDERED, name_of
 
 from analytic_rasterizer import _C
 
@@ -14,6 +15,11 @@ needs_cuda = pytest.mark.skipif(
 needs_newer_compiler = pytest.mark.skipif(
     torch.__version__.startswith("2.4."), reason="torch 2.4 cannot compile or export these calls (docs/install.md)"
 )
+
+# Tests of a footprint with its options: each that renders, one of each footprint, one of each path (see scenes.py).
+every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 # For tests of both dtypes, in place of the fixture `device`: the rasterizer has no float64 on CUDA.
 each_precision = pytest.mark.parametrize(

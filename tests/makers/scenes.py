@@ -94,11 +94,20 @@ class Camera:
         }
         return to(fields, device)
 
-    def settings(self, dtype=torch.float64, device="cpu", **footprint):
-        """ar.GaussianRasterizationSettings of this camera."""
+    def settings(self, dtype=torch.float64, device="cpu", variant=None, **more):
+        """ar.GaussianRasterizationSettings of this camera, of a (footprint, options) pair or of what `more` says."""
         import analytic_rasterizer as ar
 
-        return ar.GaussianRasterizationSettings(**self.fields(dtype, device), **footprint)
+        if variant is not None:
+            more |= {"footprint": variant[0], **variant[1]}
+        return ar.GaussianRasterizationSettings(**self.fields(dtype, device), **more)
+
+    def render(self, scene, variant=None, **more):
+        """What the rasterizer returns of a scene in this camera, on its device and in its dtype."""
+        import analytic_rasterizer as ar
+
+        means = scene["means3D"]
+        return ar.GaussianRasterizer(self.settings(means.dtype, means.device, variant, **more))(**scene)
 
     def shifted(self, x, y):
         """The same camera with every splat moved by (x, y) px in the image."""
@@ -173,13 +182,27 @@ def with_precomputed(scene, seed=0, scale_modifier=1.0):
     return out
 
 
+def probe(image, seed=2, low=-1.0):
+    """Fixed weights of an image's numbers, which make a loss of it: a wrong pixel shows in its gradients."""
+    return rand(torch.Generator().manual_seed(seed), *image.shape, low=low).to(image)
+
+
+def without(scene, *names):
+    """The scene but for some of its inputs, such as the means2D that stages do not take."""
+    return {name: value for name, value in scene.items() if name not in names}
+
+
 def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
     """Gaussians that project to exactly these splats under an AxisCamera.
 
     Their covariance has no extent along z, so the projection Jacobian's third column multiplies
     zero and cov2d = (focal / z)^2 * cov3d_xy wherever the splat is. means2d (P, 2) px, cov2d (P, 3)
-    px^2.
+    or (3,) px^2, opacities and depths (P,), as tensors or lists.
     """
+    means2d, cov2d, opacities, depths = (
+        torch.as_tensor(value, dtype=torch.float64) for value in (means2d, cov2d, opacities, depths)
+    )
+    cov2d = cov2d.expand(len(means2d), 3)
     size = torch.tensor([camera.image_width, camera.image_height], dtype=torch.float64)
     tangent = torch.tensor([camera.tanfovx, camera.tanfovy], dtype=torch.float64)
     focal = size / (2 * tangent)
@@ -196,6 +219,18 @@ def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
         "opacities": opacities.reshape(-1, 1),
         "colors_precomp": torch.ones(count, 3, dtype=torch.float64) if colors is None else colors,
         "cov3D_precomp": cov3d,
+    }
+
+
+def balls(means, scale, opacity=1.0, colors=None):
+    """Gaussians (P, 3) of one size in float64, white where there are no colours (P, 3)."""
+    ones = torch.ones(len(means), 3, dtype=torch.float64)
+    return {
+        "means3D": means,
+        "scales": scale * ones,
+        "rotations": torch.tensor([[1.0, 0, 0, 0]] * len(means), dtype=torch.float64),
+        "opacities": opacity * ones[:, :1],
+        "colors_precomp": ones if colors is None else colors,
     }
 
 
@@ -239,6 +274,20 @@ def to(named, device):
 def settings_to(settings, device):
     """ar.GaussianRasterizationSettings with their tensors on another device."""
     return settings._replace(**to(settings._asdict(), device))
+
+
+def of_view(view, variant, size=None, dtype=torch.float64):
+    """Settings of a stored view with harmonics of degree 3, in px of its own or of another (width, height)."""
+    width, height = size or (view["width"], view["height"])
+    tangents = {
+        f"tanfov{axis}": view[side] / (2 * view[f"f{axis}"]) for axis, side in (("x", "width"), ("y", "height"))
+    }
+    camera = Camera(image_width=width, image_height=height, sh_degree=3, **tangents)
+    w2c = torch.tensor(view["w2c"], dtype=torch.float64).reshape(4, 4)
+    matrices = {"viewmatrix": w2c.T, "projmatrix": (camera.perspective() @ w2c).T}
+    matrices["campos"] = torch.linalg.inv(w2c)[:3, 3]
+    exact = {name: value.to(dtype).contiguous() for name, value in matrices.items()}
+    return camera.settings(dtype, "cpu", variant)._replace(**exact)
 
 
 def leaves(scene):
