@@ -9,6 +9,7 @@ import math
 import pickle
 import types
 
+import originals
 import pytest
 import reference
 import scenes
@@ -25,20 +26,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import _C, rasterizer
 from analytic_rasterizer.footprints import check_device
 
-FIELDS = (
-    "image_height",
-    "image_width",
-    "tanfovx",
-    "tanfovy",
-    "bg",
-    "scale_modifier",
-    "viewmatrix",
-    "projmatrix",
-    "sh_degree",
-    "campos",
-    "prefiltered",
-    "debug",
-)
+FIELDS = tuple(originals.BASE)
 CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1)
 Settings = ar.GaussianRasterizationSettings
 
@@ -71,8 +59,7 @@ def gradients(scene, settings=None):
     """(color, radii, gradients by name) of sum(color * fixed weights)."""
     leaves = scenes.leaves(scene)
     color, radii = render(leaves, settings)
-    g = torch.Generator().manual_seed(2)
-    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
+    (color * scenes.probe(color)).sum().backward()
     return color.detach(), radii, {name: leaf.grad for name, leaf in leaves.items()}
 
 
@@ -80,18 +67,10 @@ def gradients(scene, settings=None):
 
 
 def test_public_names():
-    expected = {
-        "FOOTPRINTS",
-        "TILE",
-        "GaussianRasterizationSettings",
-        "GaussianRasterizer",
-        "footprint_weight",
-        "get_default_footprint",
-        "rasterize_gaussians",
-        "render_stages",
-        "set_default_footprint",
-    }
-    assert expected <= set(ar.__all__)
+    classes = {"GaussianRasterizationSettings", "GaussianRasterizer"}
+    functions = {"rasterize_gaussians", "render_stages", "footprint_weight"}
+    assert classes | functions | {"FOOTPRINTS", "TILE"} <= set(ar.__all__)
+    assert {"get_default_footprint", "set_default_footprint"} <= set(ar.__all__)
     assert all(hasattr(ar, name) for name in ar.__all__)
 
 
@@ -213,9 +192,7 @@ def test_make():
 def test_settings_without_footprint_follow_the_default():
     """The default is looked up when rendering, so set_default_footprint works on existing code."""
     settings = CAMERA.settings(torch.float32)
-    expected = {
-        name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0] for v in RENDERED
-    }
+    expected = {name_of(v): render(scene32(), CAMERA.settings(torch.float32, variant=v))[0] for v in RENDERED}
     assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
     ar.set_default_footprint("box", samples=1)
     assert torch.equal(render(scene32(), settings)[0], expected["box-1"])
@@ -265,14 +242,10 @@ def test_call_forms_agree(device):
     assert expected.device == radii.device == scene["means3D"].device
     rasterizer = ar.GaussianRasterizer(raster_settings=settings)
     assert isinstance(rasterizer, torch.nn.Module)
-    positional = rasterizer(
-        scene["means3D"], scene["means2D"], scene["opacities"], scene["shs"], None,
-        scene["scales"], scene["rotations"],
-    )  # fmt: skip
-    functional = ar.rasterize_gaussians(
-        scene["means3D"], scene["means2D"], scene["shs"], None, scene["opacities"],
-        scene["scales"], scene["rotations"], None, settings,
-    )  # fmt: skip
+    order = "means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations"
+    positional = rasterizer(*map(scene.get, order))
+    order = "means3D", "means2D", "shs", "colors_precomp", "opacities", "scales", "rotations", "cov3D_precomp"
+    functional = ar.rasterize_gaussians(*map(scene.get, order), settings)
     with torch.no_grad():
         inference = render(scenes.leaves(scene), settings)
     tracked = render(scenes.leaves(scene), settings)
@@ -291,8 +264,7 @@ def test_some_inputs_without_gradient(device):
     for name in scene:
         leaves = {k: v.clone().requires_grad_(k == name) for k, v in scene.items()}
         color, _ = render(leaves)
-        g = torch.Generator().manual_seed(2)
-        (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
+        (color * scenes.probe(color)).sum().backward()
         assert torch.equal(leaves[name].grad, full[name]), name
         assert all(leaf.grad is None for k, leaf in leaves.items() if k != name)
 
@@ -319,10 +291,8 @@ def test_image_gradients_of_any_layout(device):
     assert torch.equal(by_sum, by_strided)
     negated = torch._neg_view(torch.full_like(color, -1.0))
     assert torch.equal(by_sum, torch.autograd.grad(color, leaves["means3D"], negated, retain_graph=True)[0])
-    parts = [
-        torch.autograd.grad(color[:, rows].sum(), leaves["means3D"], retain_graph=True)[0]
-        for rows in (slice(0, 20), slice(20, 37))
-    ]
+    sums = color[:, :20].sum(), color[:, 20:].sum()
+    parts = [torch.autograd.grad(part, leaves["means3D"], retain_graph=True)[0] for part in sums]
     # Two float32 sums in another order: 37 * 45 terms, far from cancelling to 1e-3.
     assert (sum(parts) - by_sum).abs().max() < 1e-4 * by_sum.abs().max()
 
@@ -346,11 +316,9 @@ def test_a_derivative_in_forward_mode_is_refused(device):
     scene = scene32(device)
     offset, cov2d = torch.tensor([0.3, 0.2], device=device), torch.tensor([1.0, 0.0, 2.0], device=device)
     rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
+    picture = lambda means: rasterizer(**scene | {"means3D": means})[0]  # noqa: E731
     functions = {
-        "rasterize has no .* tangent of means3D": (
-            lambda m: rasterizer(**{**scene, "means3D": m})[0],
-            scene["means3D"],
-        ),
+        "rasterize has no .* tangent of means3D": (picture, scene["means3D"]),
         "footprint_weight has no .* tangent of offset": (lambda d: ar.footprint_weight(d, cov2d), offset),
     }
     for message, (function, value) in functions.items():
@@ -380,11 +348,8 @@ def test_strided_inputs(device):
     """Columns of a larger tensor, transposed matrices: everything as if contiguous."""
     scene = scene32(device)
     expected = gradients(scene)
-    strided = {}
-    for name, value in scene.items():
-        wide = torch.stack([value, value + 1], -1)[..., 0]
-        assert not wide.is_contiguous() or wide.numel() == 0
-        strided[name] = wide
+    strided = {name: torch.stack([value, value + 1], -1)[..., 0] for name, value in scene.items()}
+    assert not any(wide.is_contiguous() for wide in strided.values())
     fields = CAMERA.fields(torch.float32, device)
     for name in ("viewmatrix", "projmatrix"):
         fields[name] = fields[name].T.contiguous().T
@@ -393,8 +358,7 @@ def test_strided_inputs(device):
     fields["campos"] = torch.stack([fields["campos"]] * 2, -1)[:, 0]
     leaves = {name: value.detach().requires_grad_() for name, value in strided.items()}
     color, radii = render(leaves, Settings(**fields))
-    g = torch.Generator().manual_seed(2)
-    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
+    (color * scenes.probe(color)).sum().backward()
     assert torch.equal(color, expected[0])
     assert torch.equal(radii, expected[1])
     for name, leaf in leaves.items():
@@ -421,15 +385,12 @@ def test_settings_in_other_forms(device, change):
     assert torch.equal(actual[1], expected[1])
 
 
+NO_NUMBER = TypeError, ValueError
+
+
 @pytest.mark.parametrize(
     "value, error",
-    [
-        (24.5, ValueError),
-        (math.nan, ValueError),
-        ("24", TypeError),
-        (True, TypeError),
-        (torch.ones(2), (TypeError, ValueError)),
-    ],
+    [(24.5, ValueError), (math.nan, ValueError), ("24", TypeError), (True, TypeError), (torch.ones(2), NO_NUMBER)],
     ids=str,
 )
 @pytest.mark.parametrize("name", ["image_height", "image_width", "sh_degree"])
@@ -441,12 +402,6 @@ def test_sizes_and_degrees_are_whole_numbers(name, value, error):
     if name != "sh_degree":
         with pytest.raises(error, match=f"{name.split('_')[1]} must be a whole number, got"):
             ar.camera_settings(torch.eye(4), **size, fx=30.0, fy=30.0)
-
-
-def test_settings_of_another_class_belong_to_the_dialects():
-    settings = types.SimpleNamespace(**CAMERA.fields(torch.float32, "cpu"))
-    with pytest.raises(TypeError, match="settings must be a GaussianRasterizationSettings, got SimpleNamespace"):
-        render(scene32(), settings)
 
 
 def test_flat_opacities(device):
@@ -717,8 +672,11 @@ def test_a_scale_modifier_that_requires_a_gradient_is_refused(device):
 
 
 def test_settings_of_another_class_are_named(device):
-    """Also where they are a tuple, whose fields could be taken for the settings of several cameras."""
+    """They belong to the dialects. Also where they are a tuple, whose fields could be taken for the settings of several
+    cameras."""
     settings, scene = CAMERA.settings(torch.float32, device), scene32(device)
+    with pytest.raises(TypeError, match="settings must be a GaussianRasterizationSettings, got SimpleNamespace"):
+        render(scene, types.SimpleNamespace(**settings._asdict()))
     del scene["means2D"]
     other = collections.namedtuple("Settings", settings._fields)(*settings)
     for call in (ar.project, ar.render_stages):
@@ -779,14 +737,14 @@ def test_wrong_footprints(keywords, pattern):
 
 def test_mark_visible_errors(device):
     rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
-    with pytest.raises(ValueError, match=r"positions must .*got \(5, 2\)"):
-        rasterizer.markVisible(t(5, 2, device=device))
-    with pytest.raises(TypeError, match=r"positions must .*got"):
-        rasterizer.markVisible(t(5, 3, device=device).long())
-    with pytest.raises(TypeError, match=r"positions must .*got"):
-        rasterizer.markVisible([[0.0, 0.0, 0.0]])
-    with pytest.raises(ValueError, match=r"positions must be on the device of viewmatrix, .*got meta"):
-        rasterizer.markVisible(t(5, 3, device=META))
+    for positions, error, message in (
+        (t(5, 2, device=device), ValueError, r"positions must .*got \(5, 2\)"),
+        (t(5, 3, device=device).long(), TypeError, "positions must .*got"),
+        ([[0.0, 0.0, 0.0]], TypeError, "positions must .*got"),
+        (t(5, 3, device=META), ValueError, "positions must be on the device of viewmatrix, .*got meta"),
+    ):
+        with pytest.raises(error, match=message):
+            rasterizer.markVisible(positions)
     for view, error in ((t(3, 3, device=device), ValueError), (None, TypeError)):
         with pytest.raises(error, match=r"viewmatrix must .*got"):
             settings = rasterizer.raster_settings._replace(viewmatrix=view)
@@ -812,8 +770,7 @@ def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):
 def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    function, arguments = calls(("box", {"samples": 4}), device, False)["rasterize_vjp"]
-    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    function, named = call_of("rasterize_vjp", ("box", {"samples": 4}), device)
     named |= {"debug": True, "dL_doutputs": [torch.ones(3, 5, 5, device=device)]}
     with pytest.raises(ValueError, match=r"dL_dcolor must have shape \(3, 37, 45\), got \(3, 5, 5\)"):
         function(**named)
@@ -825,8 +782,7 @@ def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, 
 
 def test_saved_counts_that_are_none(device):
     """The CPU refuses them; CUDA, which would have to wait for the answer, leaves their rows out."""
-    function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
-    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    function, named = call_of("project_vjp", ("box", {"samples": 1}), device)
     expected = function(**named)[0]
     ends, splits = named["saved"]
     for wrong in (2**30 + torch.arange(ends.shape[1], device=device), torch.tensor(-3, device=device)):
@@ -843,8 +799,7 @@ def test_saved_counts_that_are_none(device):
 
 
 def test_saved_splits_that_do_not_rise(device):
-    function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
-    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    function, named = call_of("project_vjp", ("box", {"samples": 1}), device)
     *kept, splits = named["saved"]
     last = splits[-1].item()
     for wrong in ([0, -(2**63), last], [0, last + 1, last], [1, last, last], [0, last], [[0, last, last]]):
@@ -855,8 +810,7 @@ def test_saved_splits_that_do_not_rise(device):
 @pytest.mark.parametrize("full", [False, True], ids=["plain", "full"])
 def test_what_was_saved_for_other_arguments_is_refused(device, full):
     """For other images, of which the channels would be read where there are none, and for other Gaussians."""
-    function, arguments = calls(("analytic", {}), device, full)["rasterize_vjp"]
-    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    function, named = call_of("rasterize_vjp", ("analytic", {}), device, full)
     zeros = torch.zeros_like(named["means3D"][:, 0])
     image = torch.zeros(named["image_height"], named["image_width"], device=device)
     with pytest.raises(ValueError, match="saved must end with the channels of the forward pass"):
@@ -879,11 +833,9 @@ def test_cuda_tensors_without_cuda_say_what_to_do():
 
 
 def test_debug_changes_no_bit(device):
-    plain = gradients(scene32(device))
-    debug = gradients(scene32(device), CAMERA.settings(torch.float32, device)._replace(debug=True))
-    assert torch.equal(plain[0], debug[0])
-    for name, gradient in plain[2].items():
-        assert torch.equal(gradient, debug[2][name])
+    color, _, plain = gradients(scene32(device))
+    debugged, _, grads = gradients(scene32(device), CAMERA.settings(torch.float32, device)._replace(debug=True))
+    assert torch.equal(color, debugged) and all(torch.equal(gradient, grads[name]) for name, gradient in plain.items())
 
 
 # --- torch.library -----------------------------------------------------------------------------
@@ -892,6 +844,12 @@ def test_debug_changes_no_bit(device):
 def calls(variant, device, full):
     """Arguments of every op, of all that the package does with them; `full`: a full camera, and outputs."""
     return _calls(variant[0], tuple(variant[1].items()), device, full)
+
+
+def call_of(op, variant, device, full=False):
+    """The function of an op, and its arguments by name."""
+    function, arguments = calls(variant, device, full)[op]
+    return function, dict(zip((argument.name for argument in function._schema.arguments), arguments))
 
 
 @functools.cache
@@ -913,10 +871,8 @@ def _calls(footprint, options, device, full):
         splats = ar.project([settings, settings], **leaves)
         image, alpha = ar.blend(splats, ar.list_tiles(splats), torch.ones(len(splats.means2d), 5, device=device))
         one = splats.split()[0]
-        looks = dict.fromkeys(_C.SUMMARIES, True)
-        torch.ops.analytic_rasterizer.inspect(
-            list(ar.list_tiles(one).tensors), one.depths.detach(), **one.size, **looks
-        )
+        lists, looks = list(ar.list_tiles(one).tensors), dict.fromkeys(_C.SUMMARIES, True)
+        torch.ops.analytic_rasterizer.inspect(lists, one.depths.detach(), **one.size, **looks)
         (image.sum() + alpha.sum()).backward()
         of_rows = [t.detach().requires_grad_() for t in (splats.means2d, splats.cov2d, splats.opacities)]
         table = torch.ones(len(splats.means2d), 4 if full else 3, device=device, requires_grad=True)
@@ -941,15 +897,8 @@ def _calls(footprint, options, device, full):
 OPS = {
     *("rasterize", "rasterize_timed", "rasterize_vjp", "project", "project_vjp", "bin", "blend", "blend_vjp"),
     *(f"prepare_{what}{suffix}" for what in ("cameras", "lens") for suffix in ("", "_vjp")),
-    *(
-        "repeat_at_seam",
-        "repeat_at_seam_vjp",
-        "composite",
-        "composite_vjp",
-        "inspect",
-        "footprint_weight",
-        "footprint_weight_vjp",
-    ),
+    *(f"{op}{suffix}" for op in ("repeat_at_seam", "composite", "footprint_weight") for suffix in ("", "_vjp")),
+    "inspect",
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, ..., test_distributed.py
     *("ssim_map", "l1_ssim", "activate", "apply_3d_filter", "correct_colors"),
@@ -960,11 +909,8 @@ OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_opt
 
 
 def test_every_op_is_checked():
-    registered = {
-        name.split("::")[1].split(".")[0]
-        for name in torch._C._dispatch_get_all_op_names()
-        if name.startswith("analytic_rasterizer::")
-    }
+    named = (name.partition("::") for name in torch._C._dispatch_get_all_op_names())
+    registered = {name.split(".")[0] for namespace, _, name in named if namespace == "analytic_rasterizer"}
     assert registered == OPS | OPS_WITH_TESTS_OF_THEIR_OWN
 
 
@@ -1038,7 +984,7 @@ def test_opcheck_of_bin_in_a_large_image(device):
     """Where the tiles of `moment` with one cell are larger on CUDA than in small images."""
     camera = dataclasses.replace(CAMERA, image_width=512, image_height=512)
     settings = camera.settings(torch.float32, device, footprint="moment", samples=1)
-    scene = {name: value for name, value in scene32(device).items() if name != "means2D"}
+    scene = scenes.without(scene32(device), "means2D")
     with Calls() as mode:
         ar.list_tiles(ar.project(settings, **scene))
     function, arguments = mode.first["bin"]

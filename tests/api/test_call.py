@@ -16,10 +16,12 @@ from analytic_rasterizer.render.arguments import camera_arguments, gaussian_argu
 CAMERA = scenes.Camera()
 
 
+def scene_on(device, count=20):
+    return scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device)
+
+
 def arguments_of_op(device):
-    settings = CAMERA.settings(torch.float32, device)
-    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device)
-    scene["means2D"] = torch.zeros_like(scene["means3D"])
+    settings, scene = CAMERA.settings(torch.float32, device), scene_on(device)
     optional = {**scenes.leaves(scene), "colors_precomp": None, "cov3D_precomp": None}
     gaussians = gaussian_arguments(settings, optional.pop("means3D"), optional.pop("opacities"), **optional)
     return {**gaussians, **camera_arguments(settings, gaussians["means3D"], gaussians["shs"]), "bg": settings.bg}
@@ -112,7 +114,7 @@ class Logged(torch.Tensor):
 
 
 def test_what_overrides_functions_of_torch_sees_the_op(device):
-    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device) | {"means2D": None}
+    scene = scene_on(device) | {"means2D": None}
     rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
     expected, _ = rasterizer(**scene)
     made, _ = rasterizer(**scene | {"means3D": scene["means3D"].as_subclass(Logged)})
@@ -124,10 +126,7 @@ def test_what_overrides_functions_of_torch_sees_the_op(device):
 @needs_newer_compiler
 def test_torch_compile(device):
     """It traces through the rasterizer without a break, by torch.ops."""
-    settings = CAMERA.settings(torch.float32, device)
-    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device)
-    scene["means2D"] = torch.zeros_like(scene["means3D"])
-    rasterizer = ar.GaussianRasterizer(settings)
+    scene, rasterizer = scene_on(device), ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
 
     def picture(gaussians):
         return 2 * rasterizer(**gaussians)[0]
@@ -161,10 +160,7 @@ class Pictures(torch.nn.Module):
 def test_torch_export_for_any_number_of_gaussians(device, effects):
     names = "means3D", "opacities", "shs", "scales", "rotations"
     module = Pictures(CAMERA.settings(torch.float32, device, effects=effects))
-    few, many = (
-        tuple(scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device)[name] for name in names)
-        for count in (20, 33)
-    )
+    few, many = (tuple(map(scene_on(device, count).get, names)) for count in (20, 33))
     count = torch.export.Dim("count", min=2, max=1000)
     exported = torch.export.export(module, few, dynamic_shapes=({0: count},) * len(names)).module()
     for scene in (few, many):

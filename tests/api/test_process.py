@@ -11,6 +11,7 @@ import torch
 from marks import each_path, needs_cuda
 from processes import DEADLINE, in_threads, run_python
 from scenes import KINDS, Camera
+from threads import assert_identical
 
 import analytic_rasterizer as ar
 
@@ -30,14 +31,8 @@ def render(rasterizer, scene, device="cpu"):
     """Image, radii and gradients of one call, on the CPU."""
     leaves = scenes.leaves(scenes.to(scene, device))
     color, radii = rasterizer(**leaves)
-    weights = scenes.rand(torch.Generator().manual_seed(1), *color.shape, low=-1.0).to(color)
-    color.backward(weights)
+    color.backward(scenes.probe(color, seed=1))
     return [result.cpu() for result in (color.detach(), radii, *(leaf.grad for leaf in leaves.values()))]
-
-
-def assert_identical(first, second):
-    for a, b in zip(first, second, strict=True):
-        assert torch.equal(a, b)
 
 
 # --- memory ------------------------------------------------------------------------------------

@@ -72,13 +72,7 @@ def test_matches_the_reference(device, best, variant, name):
     if name == "near_far":
         z = expected.projection.depths
         assert (radii.cpu()[(z < 3) | (z > 4.2)] == 0).all() and (radii > 0).sum() > 5
-    # Pixels that are near a threshold may fall to its other side in float32.
-    clear = expected.pixel_margin > (1e-4 if best == torch.float32 else 1e-9)
-    tolerance = {torch.float64: 1e-10, torch.float32: 2e-5}[best]
-    assert ((image.detach().cpu() - expected.color.detach()).abs() * clear).max() < tolerance
-    g = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * clear
-    (image * g.to(image)).sum().backward()
-    (expected.color * g).sum().backward()
+    compare_images(image, expected, best)
     for pair in ((leaves, exact), (camera, theirs)):
         for key in pair[0]:
             if key == "means2D":
@@ -90,14 +84,24 @@ def test_matches_the_reference(device, best, variant, name):
             assert (ours - want).abs().max() < scale * (1e-8 if best == torch.float64 else 3e-3), key
 
 
+def compare_images(image, expected, dtype):
+    """And makes the gradients of both, of the same loss."""
+    # Pixels that are near a threshold may fall to its other side in float32.
+    clear = expected.pixel_margin > (1e-4 if dtype == torch.float32 else 1e-9)
+    tolerance = {torch.float64: 1e-10, torch.float32: 2e-5}[dtype]
+    assert ((image.detach().cpu() - expected.color.detach()).abs() * clear).max() < tolerance
+    g = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * clear
+    (image * g.to(image)).sum().backward()
+    (expected.color * g).sum().backward()
+
+
 # --- pose and focal lengths -----------------------------------------------------------------------
 
 
 def pinhole(tangent, fx, fy, cx, cy, effects, dtype=torch.float64, footprint="cumulant", size=(35, 27), **options):
     view = ar.moved(CAMERA.world_to_camera(), tangent)
-    return ar.camera_settings(
-        view, *size, fx, fy, cx, cy, dtype=dtype, sh_degree=1, effects=effects, footprint=footprint, **options
-    )
+    options |= {"dtype": dtype, "footprint": footprint}
+    return ar.camera_settings(view, *size, fx, fy, cx, cy, sh_degree=1, effects=effects, **options)
 
 
 @pytest.mark.parametrize("orthographic", [False, True], ids=["perspective", "orthographic"])
@@ -112,10 +116,9 @@ def test_gradcheck_of_the_pose_and_the_focal_lengths(variant, orthographic):
     scale = 1 if not orthographic else 1 / 4
 
     def run(tangent, fx, fy, cx, cy, aperture, focus, exposure, velocity, turn, screen, means):
-        effects = ar.Effects(
-            camera_gradients=True, off_center=True, orthographic=orthographic, depth=True, inverse_depth=True,
-            defocus=ar.Defocus(aperture, focus), motion=ar.Motion(exposure, velocity, turn, screen),
-        )  # fmt: skip
+        blurs = {"defocus": ar.Defocus(aperture, focus), "motion": ar.Motion(exposure, velocity, turn, screen)}
+        flags = dict.fromkeys(("camera_gradients", "off_center", "depth", "inverse_depth"), True)
+        effects = ar.Effects(**flags, **blurs, orthographic=orthographic)
         settings = pinhole(tangent, fx, fy, cx, cy, effects, footprint=footprint, **options)
         color, _, outputs = ar.GaussianRasterizer(settings)(**{**scene, "means3D": means, "means2D": None})
         return color, outputs.depth, outputs.inverse_depth
@@ -139,8 +142,8 @@ def test_a_focal_length_that_requires_a_gradient_switches_gradients_of_the_camer
     assert torch.autograd.gradcheck(picture, tuple(focal.detach().clone().requires_grad_()), atol=1e-6, fast_mode=True)
 
     def stages(fx, fy):
-        arguments = {name: value for name, value in scene.items() if name != "means2D"}
-        splats = ar.project(pinhole(torch.zeros(6), fx, fy, 17.9, 13.1, None), **arguments)
+        settings = pinhole(torch.zeros(6), fx, fy, 17.9, 13.1, None)
+        splats = ar.project(settings, **scenes.without(scene, "means2D"))
         return ar.blend(splats, ar.list_tiles(splats))[0]
 
     assert torch.autograd.gradcheck(stages, tuple(focal.detach().clone().requires_grad_()), atol=1e-6, fast_mode=True)
@@ -166,9 +169,8 @@ def test_gradcheck_where_the_clamp_holds():
 
     inputs = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (40.0, 38.0, 19.0, 12.0)]
     assert run(*inputs).detach().abs().max() > 0.01
-    clamped = [ar.GaussianRasterizer(pinhole(torch.zeros(6).double(), 40.0, 38.0, 19.0, 12.0, effects))(
-        **{**scene, "means2D": None})[0] for effects in (ar.Effects(off_center=True), None)]  # fmt: skip
-    assert not torch.equal(*clamped)
+    both = (pinhole(torch.zeros(6).double(), 40.0, 38.0, 19.0, 12.0, e) for e in (ar.Effects(off_center=True), None))
+    assert not torch.equal(*(ar.GaussianRasterizer(settings)(**scene)[0] for settings in both))
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=True)
 
 
@@ -176,9 +178,8 @@ def test_camera_settings_are_those_of_3dgs(device, best):
     """The same tensors as the plain way of putting them together, and the same picture."""
     camera = Camera(image_height=27, image_width=35, shift=(2.3, -1.4), sh_degree=1)
     plain = camera.settings(best)
-    made = ar.camera_settings(
-        camera.world_to_camera(), 35, 27, 35 / 1.2, 27.0, 35 / 2 + 2.3, 27 / 2 - 1.4, sh_degree=1, dtype=best
-    )
+    intrinsics = 35 / 1.2, 27.0, 35 / 2 + 2.3, 27 / 2 - 1.4
+    made = ar.camera_settings(camera.world_to_camera(), 35, 27, *intrinsics, sh_degree=1, dtype=best)
     for name in ("viewmatrix", "campos", "tanfovx", "tanfovy"):
         assert torch.allclose(torch.as_tensor(getattr(made, name)), torch.as_tensor(getattr(plain, name)), atol=1e-6)
     assert torch.allclose(made.projmatrix[:, [0, 1, 3]], plain.projmatrix[:, [0, 1, 3]], atol=1e-6)
@@ -198,10 +199,8 @@ def test_a_view_that_scales_shows_the_same(device, best, factor, orthographic):
         view[:3] *= factor
         focal = 8 / factor if orthographic else 30.0
         effects = ar.Effects(orthographic=orthographic, near=0.2 * factor)
-        settings = ar.camera_settings(
-            view, 35, 27, focal, focal, sh_degree=1, dtype=best, device=device, footprint="box", effects=effects
-        )
-        return ar.GaussianRasterizer(settings)(**scene)
+        options = {"dtype": best, "device": device, "footprint": "box", "effects": effects}
+        return ar.GaussianRasterizer(ar.camera_settings(view, 35, 27, focal, focal, sh_degree=1, **options))(**scene)
 
     (expected, radii), (made, made_radii) = picture(1.0), picture(factor)
     assert (radii > 0).sum() > 100
@@ -244,13 +243,12 @@ def test_a_far_camera_is_orthographic():
     distance = 1e5  # in float64, which is to say on the CPU
     view = torch.eye(4, dtype=torch.float64)
     view[2, 3] = distance
-    near = ar.Effects(orthographic=True)
-    parallel, _ = ar.GaussianRasterizer(
-        ar.camera_settings(view, 40, 30, 10.0, 10.0, dtype=torch.float64, sh_degree=1, effects=near)
-    )(**scene)
-    pinhole, _ = ar.GaussianRasterizer(
-        ar.camera_settings(view, 40, 30, 10.0 * distance, 10.0 * distance, dtype=torch.float64, sh_degree=1)
-    )(**scene)
+
+    def picture(focal, effects=None):
+        options = {"dtype": torch.float64, "sh_degree": 1, "effects": effects}
+        return ar.GaussianRasterizer(ar.camera_settings(view, 40, 30, focal, focal, **options))(**scene)[0]
+
+    parallel, pinhole = picture(10.0, ar.Effects(orthographic=True)), picture(10.0 * distance)
     assert parallel.max() > 0.3
     assert (parallel - pinhole).abs().max() < 1e-2  # a threshold may fall the other way; most pixels:
     assert (parallel - pinhole).abs().mean() < 1e-4
@@ -304,12 +302,12 @@ def plate(seed, count, z, dtype, sigma=(0.02, 0.3)):
     return scenes.cast(scene, dtype)
 
 
-def facing(effects, dtype, device, footprint="box:samples=1", size=(40, 32)):
-    settings = ar.camera_settings(
-        torch.eye(4, dtype=torch.float64), *size, 30.0, 30.0, dtype=dtype, sh_degree=0, effects=effects,
-        footprint=footprint,
-    )  # fmt: skip
-    return scenes.settings_to(settings, device)
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def facing(effects, dtype, device, footprint="box:samples=1", size=(40, 32), view=EYE):
+    options = {"dtype": dtype, "device": device, "effects": effects, "footprint": footprint}
+    return ar.camera_settings(view, *size, 30.0, 30.0, sh_degree=0, **options)
 
 
 def test_defocus_is_a_wider_pixel(device, best):
@@ -360,12 +358,9 @@ def test_motion_is_the_mean_over_the_exposure(moves, device, best):
             settings = settings._replace(projmatrix=projection)
         else:
             # The world moves against the camera.
-            twist = -t * torch.tensor(
-                [*motion.get("velocity", (0, 0, 0)), *motion.get("angular_velocity", (0, 0, 0))], dtype=torch.float64
-            )
-            view = ar.moved(torch.eye(4, dtype=torch.float64), twist)
-            settings = ar.camera_settings(view, 40, 32, 30.0, 30.0, dtype=best, sh_degree=0, footprint="box:samples=1")
-            settings = scenes.settings_to(settings, device)
+            speeds = [*motion.get("velocity", (0, 0, 0)), *motion.get("angular_velocity", (0, 0, 0))]
+            twist = -t * torch.tensor(speeds, dtype=torch.float64)
+            settings = facing(None, best, device, view=ar.moved(EYE, twist))
         mean += ar.GaussianRasterizer(settings)(**scene)[0] / steps
     changed = (mean - still).abs().max()
     assert changed > 2 / 255
@@ -439,12 +434,8 @@ def test_blur_keeps_the_light(device, best):
     scene["shs"][:] = 0.5 / 0.28209479177387814
     scene = scenes.to(scene, device)
     total = []
-    for effects in (
-        None,
-        ar.Effects(defocus=ar.Defocus(0.5, 2.5)),
-        ar.Effects(motion=ar.Motion(0.1, screen_velocity=(30, 20))),
-        ar.Effects(defocus=ar.Defocus(0.5, 2.5), motion=ar.Motion(0.1, screen_velocity=(30, 20))),
-    ):
+    lens, shutter = {"defocus": ar.Defocus(0.5, 2.5)}, {"motion": ar.Motion(0.1, screen_velocity=(30, 20))}
+    for effects in (None, ar.Effects(**lens), ar.Effects(**shutter), ar.Effects(**lens, **shutter)):
         color, _ = ar.GaussianRasterizer(facing(effects, best, device, size=(64, 64)))(**scene)
         total.append(color[0].sum().item())
     # What is below 1/255 is not drawn: a tail of the level 2 ln(255 amp), share 1/(255 amp) of the mass.
@@ -464,9 +455,8 @@ def test_blurred_needles_have_gradients_in_float32(device, footprint, ratio):
         leaves = scenes.leaves(scenes.to(scenes.cast(single, dtype), where))
         effects = ar.Effects(defocus=ar.Defocus(0.02, 4.0), motion=ar.Motion(0.1, screen_velocity=(9.0, 4.0)))
         settings = CAMERA.settings(torch.float32, effects=effects, footprint=footprint)._replace(sh_degree=0)
-        settings = settings._replace(
-            **{k: getattr(settings, k).to(dtype) for k in ("bg", "viewmatrix", "projmatrix", "campos")}
-        )
+        exact = {k: getattr(settings, k).to(dtype) for k in ("bg", "viewmatrix", "projmatrix", "campos")}
+        settings = settings._replace(**exact)
         color, _ = ar.GaussianRasterizer(scenes.settings_to(settings, where))(**leaves)
         weights = torch.sin(torch.arange(color.numel(), dtype=torch.float64)).reshape(color.shape)
         (color * weights.to(color)).sum().backward()
@@ -507,13 +497,7 @@ def test_degree_four(device, best, variant):
     leaves, exact = scenes.leaves(scenes.to(scenes.cast(scene, best), device)), scenes.leaves(scene)
     image, _ = ar.GaussianRasterizer(settings)(**leaves)
     expected = reference.render(camera.settings(), **exact, footprint=footprint, **options)
-    clear = expected.pixel_margin > (1e-4 if best == torch.float32 else 1e-9)
-    assert ((image.detach().cpu() - expected.color.detach()).abs() * clear).max() < (
-        2e-5 if best == torch.float32 else 1e-10
-    )
-    g = torch.rand(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * clear
-    (image * g.to(image)).sum().backward()
-    (expected.color * g).sum().backward()
+    compare_images(image, expected, best)
     for name in ("shs", "means3D") if footprint != "analytic" else ("shs",):
         ours, want = leaves[name].grad.cpu().double(), exact[name].grad
         assert (ours - want).abs().max() < want.abs().max() * (1e-4 if best == torch.float32 else 1e-9), name
@@ -595,11 +579,7 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
         (TypeError, "tangent must be a tensor, got list", lambda: ar.moved(torch.eye(4), [0.0] * 6)),
         (TypeError, "floating-point dtype, got torch.int64", lambda: ar.moved(torch.eye(4).long(), torch.ones(6))),
         (ValueError, "fx must be positive and finite, got -1", lambda: ar.camera_settings(torch.eye(4), 4, 4, -1, 1)),
-        (
-            ValueError,
-            "fy must be positive and finite, got inf",
-            lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, math.inf),
-        ),
+        (ValueError, "fy must be positive and finite, got inf", lambda: ar.camera_settings(EYE, 4, 4, 1, math.inf)),
         (ValueError, "cx must be finite, got nan", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, math.nan)),
         (ValueError, r"tangent \(6,\), got \(4, 4\) and \(3,\)", lambda: ar.moved(torch.eye(4), torch.zeros(3))),
         (TypeError, 'effects must be an Effects or "auto", got', lambda: CAMERA.settings(effects="all")),

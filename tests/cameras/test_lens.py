@@ -11,6 +11,7 @@ from camera_reference import textbook
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
 
+EYE = torch.eye(4, dtype=torch.float64)
 SIGNS = (1, -1)
 LENSES = {
     "perspective": lambda s: ar.Lens.perspective(
@@ -54,8 +55,7 @@ def test_map_is_that_of_the_formulas(lens):
         torch.testing.assert_close(slopes[:, k], by_points, rtol=1e-7, atol=1e-7 * by_points.abs().max().item())
 
 
-def settings_of(lens, dtype=torch.float64, device="cpu", w2c=None, fx=40.0, fy=42.0, cx=25.0, cy=19.0, **effects):
-    w2c = torch.eye(4, dtype=torch.float64) if w2c is None else w2c
+def settings_of(lens, dtype=torch.float64, device="cpu", w2c=EYE, fx=40.0, fy=42.0, cx=25.0, cy=19.0, **effects):
     options = {"sh_degree": 1, "dtype": dtype, "device": device, "footprint": "box:samples=4"}
     return ar.camera_settings(w2c, 48, 36, fx, fy, cx, cy, effects=ar.Effects(lens=lens, **effects), **options)
 
@@ -69,15 +69,7 @@ def test_a_gaussian_is_seen_where_the_map_says(lens, angle):
     a = math.radians(angle)
     mean = 3 * torch.tensor([[0.8 * math.sin(a), 0.6 * math.sin(a), math.cos(a)]], dtype=torch.float64)
     focal = 40.0 if angle < 90 else 8.0
-    settings = settings_of(lens, fx=focal, fy=focal, cx=24.0, cy=18.0)
-    splats = ar.project(
-        settings,
-        means3D=mean,
-        scales=torch.full((1, 3), 0.01, dtype=torch.float64),
-        rotations=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
-        opacities=torch.ones(1, 1, dtype=torch.float64),
-        colors_precomp=torch.ones(1, 3, dtype=torch.float64),
-    )
+    splats = ar.project(settings_of(lens, fx=focal, fy=focal, cx=24.0, cy=18.0), **scenes.balls(mean, 0.01))
     u = textbook(lens, mean)[0]
     expected = focal * u + torch.tensor([24.0, 18.0], dtype=torch.float64) - 0.5  # pixel 0 has its centre at 0.5
     assert len(splats.means2d) == (a < lens.fold)  # beyond it is culled
@@ -101,14 +93,7 @@ def test_where_the_map_folds_back_nothing_is_drawn():
     angles = torch.tensor([fold - 0.02, fold + 0.02], dtype=torch.float64)
     means = torch.stack([angles.sin(), torch.zeros(2), angles.cos()], 1).double()
     settings = settings_of(lens, fx=10.0, fy=10.0, cx=24.0, cy=18.0)
-    _, radii = ar.GaussianRasterizer(settings)(
-        means3D=means,
-        means2D=None,
-        scales=torch.full((2, 3), 0.01, dtype=torch.float64),
-        rotations=torch.tensor([[1.0, 0, 0, 0]] * 2, dtype=torch.float64),
-        opacities=torch.ones(2, 1, dtype=torch.float64),
-        colors_precomp=torch.ones(2, 3, dtype=torch.float64),
-    )
+    _, radii = ar.GaussianRasterizer(settings)(means2D=None, **scenes.balls(means, 0.01))
     assert radii[0] > 0 and radii[1] == 0
 
 
@@ -177,12 +162,16 @@ def around(seed, count, sigma=(0.02, 0.5)):
     return scene | {"means3D": distance * direction}
 
 
-def sphere(width=64, height=32, w2c=None, *, footprint="box:samples=4", cx=None, cy=None, tan=1.0, bg=None, **effects):
-    """Settings of a picture of the whole sphere; `tan`: a factor of the focal lengths."""
+OF_CAMERA = ("dtype", "device", "footprint", "cx", "cy", "bg")
+
+
+def sphere(width=64, height=32, w2c=EYE, tan=1.0, **more):
+    """Settings of a picture of the whole sphere; `tan`: a factor of the focal lengths. What is no option of
+    `camera_settings` is an effect."""
+    options = {"sh_degree": 1, "dtype": torch.float64, "footprint": "box:samples=4"}
+    options |= {name: more.pop(name) for name in OF_CAMERA if name in more}
     fx, fy = tan * width / (2 * math.pi), tan * height / math.pi
-    options = {"sh_degree": 1, "dtype": torch.float64, "footprint": footprint, "bg": bg}
-    w2c = torch.eye(4, dtype=torch.float64) if w2c is None else w2c
-    return ar.camera_settings(w2c, width, height, fx, fy, cx, cy, effects=ar.Effects(lens=SPHERE, **effects), **options)
+    return ar.camera_settings(w2c, width, height, fx, fy, effects=ar.Effects(lens=SPHERE, **more), **options)
 
 
 QUARTER = torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)  # to the left
@@ -194,7 +183,7 @@ def test_a_turn_about_the_vertical_rolls_the_picture(footprint):
     scene = around(1, 150)
     images = {"alpha": True, "depth": True, "inverse_depth": True, "median_depth": True, "dominant_index": True}
     pictures = []
-    for w2c in (torch.eye(4, dtype=torch.float64), QUARTER, QUARTER @ QUARTER):
+    for w2c in (EYE, QUARTER, QUARTER @ QUARTER):
         color, radii, outputs = ar.GaussianRasterizer(sphere(w2c=w2c, footprint=footprint, **images))(**scene)
         assert (radii > 0).all()
         pictures.append([color, *(getattr(outputs, name).double() for name in images)])
@@ -214,21 +203,14 @@ def by_the_formulas(scene, settings):
     limit = math.sin(0.5 / fy)
     polar = across < limit * distance
     longitude = torch.atan2(p[:, 0], p[:, 2])
-    edge = torch.stack(
-        [
-            limit * longitude.sin(),
-            math.sqrt(1 - limit**2) * torch.where(p[:, 1] < 0, -1.0, 1.0),
-            limit * longitude.cos(),
-        ],
-        1,
-    )
+    height_of_edge = math.sqrt(1 - limit**2) * torch.where(p[:, 1] < 0, -1.0, 1.0)
+    edge = torch.stack([limit * longitude.sin(), height_of_edge, limit * longitude.cos()], 1)
     q = torch.where(polar[:, None], distance[:, None] * edge, p)
     leaf = q.clone().requires_grad_()
     seen = textbook(SPHERE, leaf)
     focal = torch.tensor([fx, fy], dtype=torch.float64)
-    jacobian = torch.stack(
-        [f * torch.autograd.grad(seen[:, k].sum(), leaf, retain_graph=True)[0] for k, f in ((0, fx), (1, fy))], 1
-    )
+    slopes = [torch.autograd.grad(seen[:, k].sum(), leaf, retain_graph=True)[0] for k in (0, 1)]
+    jacobian = torch.stack([fx * slopes[0], fy * slopes[1]], 1)
     to_pixel = jacobian @ settings.viewmatrix[:3, :3].T
     cov = to_pixel @ reference.covariance_3d(scene["scales"], scene["rotations"], 1.0) @ to_pixel.transpose(1, 2)
     means = textbook(SPHERE, p) * focal + torch.tensor([width, height]) / 2 - 0.5
@@ -269,7 +251,7 @@ def test_no_pixel_of_the_sphere_is_missed(size):
 
 def moved_quarter():
     """A pose with every angle and shift."""
-    return ar.moved(torch.eye(4, dtype=torch.float64), torch.tensor([0.1, -0.2, 0.15, 0.4, -0.7, 0.2]).double())
+    return ar.moved(EYE, torch.tensor([0.1, -0.2, 0.15, 0.4, -0.7, 0.2]).double())
 
 
 @pytest.mark.parametrize("axis", [1, -1])
@@ -279,24 +261,17 @@ def test_a_splat_on_a_pole_is_a_cap(axis, opacity, tolerance):
     the opacity, away from the pole, and for what a copy below 1/255 leaves out. Without a correction the poles would be
     at 0.17 and 0.9."""
     sigma = 0.25
-    one = torch.ones(1, 3, dtype=torch.float64)
-    _, _, outputs = ar.GaussianRasterizer(sphere(96, 48, footprint="point:dilation=0", alpha=True))(
-        means3D=torch.tensor([[0.0, 2.0 * axis, 0]], dtype=torch.float64),
-        means2D=None,
-        scales=2 * sigma * one,
-        rotations=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
-        opacities=opacity * one[:, :1],
-        colors_precomp=one,
-    )
+    ball = scenes.balls(torch.tensor([[0.0, 2.0 * axis, 0]], dtype=torch.float64), 2 * sigma, opacity)
+    settings = sphere(96, 48, footprint="point:dilation=0", alpha=True)
+    _, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **ball)
     rows = (torch.arange(48) + 0.5) * math.pi / 48
     from_pole = rows if axis < 0 else math.pi - rows
     expected = opacity * torch.exp(-0.5 * (from_pole / sigma) ** 2)
     shown = (expected > 0.02).nonzero()[:, 0]
     at_pole = outputs.alpha[0, 0 if axis < 0 else -1]
     torch.testing.assert_close(at_pole, torch.full_like(at_pole, opacity), rtol=0.01, atol=1.5 / 255)
-    torch.testing.assert_close(
-        outputs.alpha[0, shown], expected[shown, None].expand(-1, 96).double(), rtol=0, atol=tolerance
-    )
+    everywhere = expected[shown, None].expand(-1, 96).double()
+    torch.testing.assert_close(outputs.alpha[0, shown], everywhere, rtol=0, atol=tolerance)
 
 
 def test_gradients_at_the_poles_are_finite():
@@ -308,12 +283,9 @@ def test_gradients_at_the_poles_are_finite():
     lens, shutter = ar.Defocus(0.05, 3.0), ar.Motion(1.0, (0.1, 0.05, 0.1), (0.02, 0.0, 0.01))
     for dtype in (torch.float64, torch.float32):
         leaves = scenes.leaves(scenes.cast(scene, dtype, "cpu"))
-        settings = sphere(depth=True, defocus=lens, motion=shutter, camera_gradients=True)
         tangent = torch.zeros(6, dtype=torch.float64).requires_grad_()
-        settings = ar.camera_settings(
-            ar.moved(torch.eye(4, dtype=torch.float64), tangent), 64, 32, 64 / (2 * math.pi), 32 / math.pi,
-            sh_degree=1, dtype=dtype, footprint="box:samples=4", effects=settings.effects,
-        )  # fmt: skip
+        blurs = {"depth": True, "defocus": lens, "motion": shutter, "camera_gradients": True}
+        settings = sphere(w2c=ar.moved(EYE, tangent), dtype=dtype, **blurs)
         color, radii, outputs = ar.GaussianRasterizer(settings)(**leaves)
         weights = torch.linspace(-1, 1, color.numel(), dtype=dtype).reshape(color.shape)
         ((color * weights).sum() + outputs.depth.square().sum()).backward()
@@ -338,15 +310,10 @@ def test_gradients_around_the_sphere_are_derivatives():
     }
 
     def loss(values):
-        w2c = ar.moved(torch.eye(4, dtype=torch.float64), values["tangent"])
-        blur = values["blur"]
-        effects = ar.Effects(
-            lens=ar.Lens("equirectangular", (), 1.5),
-            camera_gradients=True,
-            depth=True,
-            defocus=ar.Defocus(blur[0], blur[1]),
-            motion=ar.Motion(1.0, blur[2:5], blur[5:]),
-        )
+        w2c, blur = ar.moved(EYE, values["tangent"]), values["blur"]
+        blurs = {"defocus": ar.Defocus(blur[0], blur[1]), "motion": ar.Motion(1.0, blur[2:5], blur[5:])}
+        lens = ar.Lens("equirectangular", (), 1.5)
+        effects = ar.Effects(lens=lens, camera_gradients=True, depth=True, **blurs)
         options = {"sh_degree": 1, "dtype": torch.float64, "footprint": "box:samples=4"}
         settings = ar.camera_settings(w2c, 64, 32, *values["camera"], effects=effects, **options)
         return loss_of({name: values[name] for name in scene}, settings, g)
@@ -374,9 +341,8 @@ def test_gradients_of_means2d_count_every_copy():
     for columns in (3, 4):
         scene["means2D"] = torch.full((40, columns), math.nan, dtype=torch.float64).requires_grad_()  # is not read
         color, _ = rasterize(**scene)
-        gradients[columns], by_principal = torch.autograd.grad(
-            (color * g).sum(), [scene["means2D"], principal], retain_graph=True
-        )
+        loss, inputs = (color * g).sum(), [scene["means2D"], principal]
+        gradients[columns], by_principal = torch.autograd.grad(loss, inputs, retain_graph=True)
         torch.testing.assert_close(gradients[columns][:, :2].sum(0) / half, by_principal, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(gradients[3][:, :2], gradients[4][:, :2])
     assert (gradients[3][:, 2] == 0).all()
@@ -401,7 +367,7 @@ def test_a_crop_is_a_part_of_the_picture(where):
     left = {"behind": 3, "seam": 50}[where]
     fx, fy = 64 / (2 * math.pi), 32 / math.pi
     settings = ar.camera_settings(
-        torch.eye(4, dtype=torch.float64), 24, 20, fx, fy, 32.0 - left, 16.0 - 5, sh_degree=1, dtype=torch.float64,
+        EYE, 24, 20, fx, fy, 32.0 - left, 16.0 - 5, sh_degree=1, dtype=torch.float64,
         footprint="box:samples=4", effects=ar.Effects(lens=ar.Lens("equirectangular", (), SPHERE_REACH)),
     )  # fmt: skip
     color, _ = ar.GaussianRasterizer(settings)(**scene)
@@ -420,14 +386,8 @@ def test_the_nearest_is_in_front(lens, angle):
     distance = torch.tensor([[3.0], [1], [2]], dtype=torch.float64)
     settings = settings_of(lens, fx=8.0, fy=8.0, cx=24.0, cy=18.0, depth=True, median_depth=True, alpha=True)
     rasterize = ar.GaussianRasterizer(settings)
-    color, _, outputs = rasterize(
-        means3D=distance * direction,
-        means2D=None,
-        scales=0.3 * distance.expand(3, 3),
-        rotations=torch.tensor([[1.0, 0, 0, 0]] * 3, dtype=torch.float64),
-        opacities=torch.ones(3, 1, dtype=torch.float64),
-        colors_precomp=torch.eye(3, dtype=torch.float64),
-    )
+    balls = scenes.balls(distance * direction, 0.3 * distance, colors=torch.eye(3, dtype=torch.float64))
+    color, _, outputs = rasterize(means2D=None, **balls)
     full = (outputs.alpha[0] > 0.99).nonzero()
     assert len(full)
     for row, column in full.tolist():
@@ -443,15 +403,14 @@ def test_stages_and_features_show_the_seam_too():
     scene, bg = around(7, 60), torch.rand(3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     settings = sphere(bg=bg)
     expected, radii = ar.GaussianRasterizer(settings)(**scene)
-    inputs = {name: value for name, value in scene.items() if name != "means2D"}
+    inputs = scenes.without(scene, "means2D")
     splats = ar.project([settings, sphere(w2c=QUARTER)], **inputs)
     assert (splats.gaussian_ids.bincount() > 2).any()  # copies
     image, _ = ar.blend(splats, ar.list_tiles(splats), background=torch.stack([bg, 0 * bg]))
     torch.testing.assert_close(image[0], expected)
     for camera, of_camera in enumerate(splats.split()):
-        assert (of_camera.gaussian_ids.diff() >= 0).all() and (splats.camera_ids == camera).sum() == len(
-            of_camera.radii
-        )
+        assert (of_camera.gaussian_ids.diff() >= 0).all()
+        assert (splats.camera_ids == camera).sum() == len(of_camera.radii)
     channels = torch.rand(60, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     channels[7, 2] = math.nan
     picture = bg[:, None, None].expand(3, 32, 64)
@@ -494,10 +453,9 @@ def test_copies_at_the_seam_have_the_gradients_of_differences():
 
 
 def test_directions_of_pixels_of_the_sphere():
-    view = ar.View("v", 64, 32, 64 / (2 * math.pi), 32 / math.pi, torch.eye(4, dtype=torch.float64), lens=SPHERE)
-    points = torch.nn.functional.normalize(
-        torch.randn(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), dim=1
-    )
+    view = ar.View("v", 64, 32, 64 / (2 * math.pi), 32 / math.pi, EYE, lens=SPHERE)
+    points = torch.randn(100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    points = torch.nn.functional.normalize(points, dim=1)
     torch.testing.assert_close(view.rays_of(view.pixels_of(points)), points, rtol=0, atol=1e-12)
     assert view.rays_of(torch.tensor([[3.0, -0.1], [3.0, 32.1]])).isnan().all()  # beyond the poles
 
@@ -508,10 +466,7 @@ def test_the_sphere_in_single_precision(device):
     g = torch.rand(4, 32, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
     for dtype, where in ((torch.float64, "cpu"), (torch.float32, device)):
         leaves = scenes.leaves(scenes.cast(scene, dtype, where))
-        settings = ar.camera_settings(
-            moved_quarter(), 64, 32, 64 / (2 * math.pi), 32 / math.pi, sh_degree=1, dtype=dtype, device=where,
-            footprint="box:samples=4", effects=ar.Effects(lens=SPHERE, depth=True),
-        )  # fmt: skip
+        settings = sphere(w2c=moved_quarter(), dtype=dtype, device=where, depth=True)
         loss = loss_of(leaves, settings, g.to(where, dtype))
         grads = torch.autograd.grad(loss, list(leaves.values()))
         results.append({name: grad.double().cpu() for name, grad in zip(leaves, grads)} | {"loss": loss.double().cpu()})

@@ -7,7 +7,8 @@ import reference
 import scenes
 import torch
 from op_calls import Calls
-from test_lens import LENSES, SPHERE, each_lens, settings_of
+from scenes import rand as uniform
+from test_lens import EYE, LENSES, SPHERE, each_lens, settings_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
@@ -15,10 +16,6 @@ from analytic_rasterizer import _C
 BENT = tuple(LENSES)  # models with coefficients
 WIDE = ("fisheye", "rad_tan_fisheye")
 TRACED = LENSES["fisheye"](1)  # what tracing makes of an op does not depend on the model
-
-
-def uniform(generator, *shape, low=0.0, high=1.0):
-    return low + (high - low) * torch.rand(*shape, dtype=torch.float64, generator=generator)
 
 
 def random_lens(model, seed, size=0.1):
@@ -85,7 +82,7 @@ def test_no_pixel_of_a_lens_is_missed(model, seed):
     pixels. Opacities are low: most pixels are not full."""
     lens = random_lens(model, seed, size=(0.02, 0.1, 0.3)[seed % 3])
     focal = (10.0, 40.0)[seed % 2]
-    w2c = ar.moved(torch.eye(4, dtype=torch.float64), torch.tensor([0.1, -0.2, 0.15, 0.4, -0.7, 0.2]).double())
+    w2c = ar.moved(EYE, torch.tensor([0.1, -0.2, 0.15, 0.4, -0.7, 0.2]).double())
     settings = settings_of(lens, w2c=w2c, fx=focal, fy=1.1 * focal)._replace(footprint="point")
     generator = torch.Generator().manual_seed(seed)
     scene = scenes.random_scene(seed, 150, degree=1, opacity=(0.01, 0.2), sigma=(1e-3, 5.0))
@@ -143,7 +140,7 @@ def test_no_direction_in_the_picture_is_beyond_its_reach(model, crop):
     """So that inside of the picture every Jacobian is exact; also in strips and corners of a picture."""
     width, height, cx, cy = crop
     lens = LENSES[model](1)
-    view = ar.View("v", width, height, 300.0, 300.0, torch.eye(4, dtype=torch.float64), cx, cy, lens=lens)
+    view = ar.View("v", width, height, 300.0, 300.0, EYE, cx, cy, lens=lens)
     reach = view.settings().effects.lens.reach
     x, y = torch.linspace(0, width, 40), torch.linspace(0, height, 40)
     rays = view.rays_of(torch.cartesian_prod(x, y))
@@ -156,7 +153,7 @@ def test_no_direction_in_the_picture_is_beyond_its_reach(model, crop):
     "make, error, match",
     [
         (
-            lambda: ar.Lens("fisheye", 4 * (0,) + (1,)),
+            lambda: ar.Lens("fisheye", (0, 0, 0, 0, 1)),
             ValueError,
             "coefficients 4 and 5 of a fisheye lens must be zero",
         ),
@@ -181,7 +178,7 @@ def turned_to(angle):
     """A turn of the z axis by `angle` towards x and y."""
     x, y = 0.8 * angle, 0.6 * angle
     zero = torch.zeros(())
-    return ar.moved(torch.eye(4, dtype=torch.float64), torch.stack([zero, zero, zero, -y, x, zero]).double())
+    return ar.moved(EYE, torch.stack([zero, zero, zero, -y, x, zero]).double())
 
 
 @each_lens
@@ -220,16 +217,12 @@ def test_gradcheck(lens, angle, clamped):
         given = dict(zip(leaves, numbers))
         k, blur = given.get("coefficients", ()), given["blur"]
         k = torch.nn.functional.pad(k, (0, 12 - len(k))) * units if len(k) else k
-        settings = ar.camera_settings(
-            ar.moved(torch.eye(4, dtype=torch.float64), given["tangent"]), 48, 36, *given["camera"], sh_degree=1,
-            dtype=torch.float64, footprint="box:samples=4", lens=ar.Lens(lens.model, k, reach),
-            effects=ar.Effects(
-                camera_gradients=True, alpha=True, depth=True, defocus=ar.Defocus(blur[0], blur[1]),
-                motion=ar.Motion(1.0, blur[2:5], blur[5:]),
-            ),
-        )  # fmt: skip
-        inputs = {name: given[name] for name in scene}
-        color, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **inputs)
+        blurs = {"defocus": ar.Defocus(blur[0], blur[1]), "motion": ar.Motion(1.0, blur[2:5], blur[5:])}
+        effects = ar.Effects(camera_gradients=True, alpha=True, depth=True, **blurs)
+        options = {"dtype": torch.float64, "footprint": "box:samples=4", "lens": ar.Lens(lens.model, k, reach)}
+        w2c, camera = ar.moved(EYE, given["tangent"]), given["camera"]
+        settings = ar.camera_settings(w2c, 48, 36, *camera, sh_degree=1, effects=effects, **options)
+        color, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **{name: given[name] for name in scene})
         images = torch.cat([color, outputs.alpha, outputs.depth])
         return tuple((images * weights).sum((1, 2)))
 
@@ -276,9 +269,7 @@ def test_defocus_and_motion_through_a_lens(lens, angle):
     mean = 3 * turned_to(torch.tensor(angle))[:3, 2:3].T
     velocity, turn = torch.tensor([0.1, -0.2, 0.15]).double(), torch.tensor([0.05, 0.03, -0.04]).double()
     defocus, motion = ar.Defocus(0.4, 1.5), ar.Motion(0.5, velocity, turn, (3.0, -2.0))
-    gaussian = {"means3D": mean, "scales": torch.full((1, 3), 0.02, dtype=torch.float64)}
-    gaussian |= {"rotations": torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)}
-    gaussian |= {"opacities": torch.ones(1, 1).double(), "colors_precomp": torch.ones(1, 3).double()}
+    gaussian = scenes.balls(mean, 0.02)
     middle = 10 * lens.project(mean)[0][0]
     camera = {"fx": 10.0, "fy": 12.0, "cx": 24 - middle[0].item(), "cy": 18 - 1.2 * middle[1].item()}
     plain = ar.project(settings_of(lens, **camera), **gaussian)

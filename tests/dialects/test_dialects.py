@@ -169,21 +169,16 @@ def expected_values(name, device, dtype):
     if name == "monogs":
         color, radii, outputs = of(depth=True, alpha=True, gaussian_stats=True)
         return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels_in_front
-    if name == "langsplat":
+    if name in ("langsplat", "grouping", "mcmc"):
         color, radii, _ = of()
-        return color, torch.zeros_like(color), radii
-    if name == "grouping":
-        color, radii, _ = of()
-        return color, radii, color.new_zeros(16, *color.shape[1:])
+        made = {"langsplat": (torch.zeros_like(color), radii), "mcmc": (radii, (radii > 0).int())}
+        return color, *made.get(name, (radii, color.new_zeros(16, *color.shape[1:])))
     if name == "feature3dgs":
         color, radii, outputs = of(depth=True)
         features = arguments_of(name, device, dtype)["semantic_feature"].flatten(1)
         settings = CAMERA.settings(dtype, device, footprint="point")._replace(bg=features.new_zeros(5))
         scene = scene_of(device, dtype) | {"shs": None, "colors_precomp": features}
         return color, ar.GaussianRasterizer(settings)(**scene)[0], radii, outputs.depth
-    if name == "mcmc":
-        color, radii, _ = of()
-        return color, radii, (radii > 0).int()
     if name != "mini":
         pytest.fail(f"expected_values must say what dialect {name} returns")
     color, radii, outputs = of(gaussian_stats=True, dominant_index=True)
@@ -348,18 +343,13 @@ REFUSED_SETTINGS = {"inv_viewprojmatrix": "StopThePop", "pixel_weights": "Taming
 REFUSED_ARGUMENTS = {"view2gaussian_precomp": "Gaussian Opacity Fields", "scores": "Speedy-Splat"}
 
 
-@pytest.mark.parametrize("name", REFUSED_SETTINGS)
-def test_settings_of_other_algorithms(name):
-    for dialect in ("gs2023", "mip"):
-        settings = dialects.dialect_module(dialect).GaussianRasterizationSettings
-        with pytest.raises(TypeError, match=f"^{name} is not supported: {REFUSED_SETTINGS[name]}.* own rasterizer"):
-            settings(**fields_of(dialect), **{name: None})
-
-
-@pytest.mark.parametrize("name", REFUSED_ARGUMENTS)
-def test_arguments_of_other_algorithms(name):
-    for dialect in ("gs2023", "mip", "depth"):
-        with pytest.raises(TypeError, match=f"^{name} is not supported: {REFUSED_ARGUMENTS[name]}.* own rasterizer"):
+@pytest.mark.parametrize("name, owner", [*REFUSED_SETTINGS.items(), *REFUSED_ARGUMENTS.items()])
+@pytest.mark.parametrize("dialect", ["gs2023", "mip", "depth"])
+def test_settings_and_arguments_of_other_algorithms(dialect, name, owner):
+    with pytest.raises(TypeError, match=f"^{name} is not supported: {owner}.* own rasterizer"):
+        if name in REFUSED_SETTINGS:
+            dialects.dialect_module(dialect).GaussianRasterizationSettings(**fields_of(dialect), **{name: None})
+        else:
             drop_in.GaussianRasterizer(settings_of(dialect))(**scene_of(), **{name: None})
 
 
@@ -378,15 +368,9 @@ def test_settings_are_a_tuple_that_can_be_copied(name):
     fields = fields_of(name)
     settings = settings_of(name, footprint="box:samples=1")
     by_position = type(settings)(*fields.values(), footprint="box", samples=1)
-    copies = [
-        copy.copy(settings),
-        copy.deepcopy(settings),
-        pickle.loads(pickle.dumps(settings)),
-        settings._replace(bg=settings.bg),
-        type(settings)(**settings._asdict(), footprint=settings.footprint),
-        by_position,
-    ]
-    for same in copies:
+    by_keyword = type(settings)(**settings._asdict(), footprint=settings.footprint)
+    copies = copy.copy(settings), copy.deepcopy(settings), pickle.loads(pickle.dumps(settings))
+    for same in (*copies, settings._replace(bg=settings.bg), by_keyword, by_position):
         assert type(same) is type(settings) and same._fields == settings._fields == tuple(fields)
         assert str(same.footprint) == "box:samples=1" and len(same) == len(fields)
         assert same.image_height == same[0] == 30 and same.sh_degree == 1
@@ -539,9 +523,8 @@ def test_accel_has_the_gradient_of_dc(device):
         (made * probe(made)).sum().backward()
     assert torch.equal(torch.cat([scene["dc"].grad, scene["shs"].grad], 1), whole["shs"].grad)
     only = scene_of(device) | {"shs": None, "dc": scene["dc"].detach()}
-    expected = plain(
-        device, scene=scene_of(device) | {"shs": only["dc"]}, camera=dataclasses.replace(CAMERA, sh_degree=0)
-    )
+    flat = dataclasses.replace(CAMERA, sh_degree=0)
+    expected = plain(device, scene=scene_of(device) | {"shs": only["dc"]}, camera=flat)
     assert torch.equal(render("accel", device, scene=only, sh_degree=0)[0], expected[0])
 
 
@@ -553,9 +536,8 @@ def test_sparse_adam_against_its_definition(device):
     groups = [{"params": [parameters[0]], "lr": 0.1, "name": "a"}, {"params": [parameters[1]], "name": "b"}]
     assert drop_in.SparseGaussianAdam is ar.optim.SparseGaussianAdam
     optimizer = drop_in.SparseGaussianAdam(groups, lr=0.02, eps=1e-15)
-    states = [
-        [p.detach().cpu().clone(), torch.zeros(p.shape).double(), torch.zeros(p.shape).double()] for p in parameters
-    ]
+    zeros = lambda p: torch.zeros(p.shape).double()  # noqa: E731
+    states = [[p.detach().cpu().clone(), zeros(p), zeros(p)] for p in parameters]
     for visible in ([1, 0, 1, 0, 1, 1], [0, 0, 1, 1, 0, 1], [0, 0, 0, 0, 0, 0]):
         for p, lr, (value, m, v) in zip(parameters, (0.1, 0.02), states):
             p.grad = draw(*p.shape).to(device)
@@ -619,10 +601,15 @@ def test_visible_filter_is_the_radii_of_a_picture(device, name):
     assert rasterizer.visible_filter(*(value[:0] for value in geometry.values())).shape == (0,)
 
 
+FEATURES = {
+    "langsplat": ("language_feature_precomp", 3),
+    "grouping": ("sh_objs", 16),
+    "feature3dgs": ("semantic_feature", 7),
+}
+
+
 @each_precision
-@pytest.mark.parametrize("name, key, channels", [
-    ("langsplat", "language_feature_precomp", 3), ("grouping", "sh_objs", 16), ("feature3dgs", "semantic_feature", 7),
-])  # fmt: skip
+@pytest.mark.parametrize("name, key, channels", [(name, *feature) for name, feature in FEATURES.items()])
 @pytest.mark.parametrize("colors", ["shs", "colors_precomp"])
 def test_features_are_blended_like_colors(device, dtype, name, key, channels, colors):
     """In one pass what two pictures show, and the gradients of both."""
@@ -637,7 +624,7 @@ def test_features_are_blended_like_colors(device, dtype, name, key, channels, co
     # color, and the other picture: after it, or after the radii
     color, image = made[0], made[2] if name == "grouping" else made[1]
     expected = plain(device, dtype, "point", scene=theirs)[0]
-    of_features = {k: v for k, v in theirs.items() if k != "shs"} | {"colors_precomp": of_theirs}
+    of_features = scenes.without(theirs, "shs") | {"colors_precomp": of_theirs}
     black = CAMERA.settings(dtype, device, footprint="point")._replace(bg=expected.new_zeros(channels))
     expected_image = ar.GaussianRasterizer(black)(**of_features)[0]
     tolerance = 1e-12 if dtype == torch.float64 else 2e-6
@@ -771,14 +758,8 @@ def test_minis_two_modules_have_one_filter():
     """
     assert run_python(program).split() == ["analytic", "point", "point", "mip", "mip"]
     # The module of 3DGS 2023 stays what it is.
-    assert (
-        len(
-            drop_in.GaussianRasterizer(drop_in.GaussianRasterizationSettings(**CAMERA.fields(torch.float32)))(
-                **scene_of()
-            )
-        )
-        == 2
-    )
+    settings = drop_in.GaussianRasterizationSettings(**CAMERA.fields(torch.float32))
+    assert len(drop_in.GaussianRasterizer(settings)(**scene_of())) == 2
 
 
 @each_precision
@@ -811,7 +792,7 @@ def test_depth_where_a_ray_passes_through_a_gaussian(device, dtype):
     slope = (rays * torch.linalg.solve(covariance[index], from_center)).sum(1)
     scale = torch.linalg.solve(covariance[index], rays).norm(dim=1) * from_center.norm(dim=1).clamp_min(1e-3)
     assert (slope.abs() / scale).max() < tolerance
-    precomputed = {k: v for k, v in scene.items() if k not in ("scales", "rotations")}
+    precomputed = scenes.without(scene, "scales", "rotations")
     rows, columns = torch.triu_indices(3, 3)
     precomputed["cov3D_precomp"] = covariance[:, rows, columns].to(scene["means3D"])
     again = dialects.dialect_module("mini").GaussianRasterizer(settings).render_depth(**precomputed)
@@ -827,19 +808,13 @@ def test_depth_where_a_ray_passes_through_a_gaussian(device, dtype):
 def test_relocation_against_the_paper(device):
     """[MCMC, Eq. 9] summed term by term with exact integers, for opacities up to the largest below 1."""
     opacity = torch.tensor([0.0, 1e-6, 0.005, 0.3, 0.7, 0.97, 1 - 2.0**-20, 1.0], dtype=torch.float64)
+    scales = torch.full((8, 3), 2.0, dtype=torch.float64, device=device)
     for n in (1, 2, 7, 50):
-        new, scale = ar.compute_relocation(
-            opacity.to(device),
-            torch.full((8, 3), 2.0, dtype=torch.float64, device=device),
-            torch.full((8,), n, device=device),
-        )
+        new, scale = ar.compute_relocation(opacity.to(device), scales, torch.full((8,), n, device=device))
         for i, o in enumerate(opacity.clamp(max=1 - 2.0**-24).tolist()):
             o_new = -math.expm1(math.log1p(-o) / n)
-            terms = [
-                math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * o_new ** (k + 1)
-                for i in range(1, n + 1)
-                for k in range(i)
-            ]
+            places = [(i, k) for i in range(1, n + 1) for k in range(i)]
+            terms = [math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * o_new ** (k + 1) for i, k in places]
             factor = 1.0 if o == 0 else o / math.fsum(terms)
             # The terms cancel: up to (1 + o_new)^n of them for a sum of about o.
             tolerance = 1e-15 * n * (1 + o_new) ** n / max(o, o_new, 1e-300) if o else 0
@@ -902,7 +877,7 @@ def test_native_functions(device, inputs):
         scene = scenes.with_precomputed(scene)
     scene = scenes.cast(scene, torch.float32, device)
     fields = CAMERA.fields(torch.float32, device)
-    arguments = native_arguments(device, {k: v for k, v in scene.items() if k != "means2D"}, fields)
+    arguments = native_arguments(device, scenes.without(scene, "means2D"), fields)
     count, color, radii, *buffers = _C.rasterize_gaussians(*arguments)
     leaves = scenes.leaves(scene)
     expected, expected_radii, _ = plain(device, scene=leaves)

@@ -1,5 +1,6 @@
 """The programs in benchmarks/ run, on a scene so small that their numbers mean nothing."""
 
+import collections
 import dataclasses
 import importlib
 import inspect
@@ -11,9 +12,10 @@ import shutil
 import subprocess
 import sys
 import types
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import originals
 import pages
 import pytest
 import scenes
@@ -39,14 +41,20 @@ def imports_of_benchmarks(monkeypatch):
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """A function that runs a program with arguments, and returns what it printed."""
+    """A function that runs a program, which ends with `code`, and returns what it printed; run.err is what it said."""
 
-    def run(program, *arguments):
+    def run(program, *arguments, code=None):
         monkeypatch.setattr(sys, "argv", [f"{program.__name__}.py", *map(str, arguments)])
-        program.main()
-        return capsys.readouterr().out
+        assert program.main() == code
+        out, run.err = capsys.readouterr()
+        return out
 
     return run
+
+
+def written(folder):
+    """What a program wrote to out.json there."""
+    return json.loads((folder / "out.json").read_text())
 
 
 @pytest.fixture
@@ -69,7 +77,7 @@ def test_effects(device, small_scene, run):
     effects = importlib.import_module("effects")
     options = ["--footprints", "box:samples=4", "--rounds", "1", "--scales", "2", "--threads", "1", "--device", device]
     table = run(effects, *files_of(small_scene), *options)
-    results = json.loads((small_scene / "out.json").read_text())["results"]["box:samples=4"]
+    results = written(small_scene)["results"]["box:samples=4"]
     assert list(results) == list(effects.ROWS)
     for name, result in results.items():
         assert f"| {name} |" in table
@@ -78,12 +86,11 @@ def test_effects(device, small_scene, run):
             assert min(result[side]["forward"], result[side]["forward_backward"]) > 0
 
 
-def test_footprint_figure(tmp_path, monkeypatch):
+def test_footprint_figure(tmp_path, run):
     """It is drawn, and what it draws of moving samples is what the library blends (the program compares)."""
     pytest.importorskip("matplotlib", reason="needs the analysis extra")
     figure = importlib.import_module("footprint_figure")
-    monkeypatch.setattr(sys, "argv", ["footprint_figure.py", "--out", str(tmp_path / "out.png")])
-    figure.main()
+    run(figure, "--out", tmp_path / "out.png")
     assert 10_000 < (tmp_path / "out.png").stat().st_size < 150_000
     moment, one_weight = map(figure.shares, ("moment:samples=4", "exact"))
     truth = figure.shares(figure.UNFILTERED, figure.FINE)
@@ -114,12 +121,12 @@ def test_speed(device, small_scene, run):
     lines = run(speed, *files_of(small_scene), *options, "--footprints", *footprints).splitlines()
     assert "50 Gaussians of SH degree 2, 2 views of 40x30" in lines[0]
     assert [line.split()[0] for line in lines[2:5]] == footprints
-    written = json.loads((small_scene / "out.json").read_text())
-    assert list(written["results"]) == footprints
-    for name, result in written["results"].items():
+    found = written(small_scene)
+    assert list(found["results"]) == footprints
+    for name, result in found["results"].items():
         assert all(math.isfinite(value) for value in result.values())
         assert min(result["forward"], result["forward_backward"], result["pairs"]) > 0
-        assert len(written["per_view"][name]) == 2
+        assert len(found["per_view"][name]) == 2
 
 
 def check_doors(text, doors, path, rows):
@@ -151,36 +158,20 @@ def test_doors(device, small_scene, monkeypatch, run):
         assert any(len(kwargs["Ks"]) == options.get("cameras", 1) for kwargs in found)
 
 
-def test_doors_of_a_tiny_scene(small_scene, monkeypatch, capsys, run):
+def test_doors_of_a_tiny_scene(small_scene, capsys, run):
     """Needs no files, and rows that others are compared with are there too."""
     doors = importlib.import_module("doors")
     options = ["--tiny", "--rounds", "2", "--doors", "defocus", "gsplat", "--json", str(small_scene / "out.json")]
     out = run(doors, *options)
     assert "10 Gaussians of SH degree 1, 1 views of 32x32" in out and ", 1 threads," in out
     check_doors(out, doors, small_scene / "out.json", ["plain", "plain, as defocus", "defocus", "gsplat"])
-    monkeypatch.setattr(sys, "argv", ["doors.py", "scene.ply", *options])
     with pytest.raises(SystemExit):
-        doors.main()
+        run(doors, "scene.ply", *options)
     assert "either a scene and --views, or --tiny" in capsys.readouterr().err
 
 
-class OfficialSettings(NamedTuple):
-    """Those of a fork of 3DGS: two more than ours."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: torch.Tensor
-    scale_modifier: float
-    viewmatrix: torch.Tensor
-    projmatrix: torch.Tensor
-    sh_degree: int
-    campos: torch.Tensor
-    prefiltered: bool
-    debug: bool
-    antialiasing: bool
-    kernel_size: float
+# Those of a fork of 3DGS: two more than ours.
+OfficialSettings = collections.namedtuple("OfficialSettings", [*originals.BASE, "antialiasing", "kernel_size"])
 
 
 class OfficialRasterizer:
@@ -227,7 +218,7 @@ def test_speed_against(device, small_scene, monkeypatch, run):
     lines = run(speed, *files_of(small_scene), *options, "--against", ",".join(names)).splitlines()
     assert lines[0].startswith("not_there: left out, for it is not installed")
     assert [line.split()[0] for line in lines[3:8]] == ["box:samples=1", *names[:-1]]
-    results = json.loads((small_scene / "out.json").read_text())["results"]
+    results = written(small_scene)["results"]
     assert list(results) == ["box:samples=1", *names[:-1]]
     assert "difference" not in results["box:samples=1"] and results["box:samples=1"]["pairs"] > 0
     for name in names[:-1]:
@@ -281,7 +272,7 @@ def test_table(device, small_scene, monkeypatch, capsys, run):
     options = ["--rounds", "1", "--threads", "1", "--device", device, "--against", "official"]
     arguments = [*columns, *options, "--footprints", "mip", "analytic", "--json", str(small_scene / "out.json")]
     lines = run(table, *arguments).splitlines()
-    results = json.loads((small_scene / "out.json").read_text())["results"]
+    results = written(small_scene)["results"]
     assert lines[2] == "| forward / forward + backward, ms | first | second one |"
     for line, name in zip(lines[4:7], ("mip", "analytic", "official"), strict=True):
         cells = [cell.strip() for cell in line.strip("|").split("|")]
@@ -291,27 +282,23 @@ def test_table(device, small_scene, monkeypatch, capsys, run):
         ]
         assert cells == [name, *expected]
     assert lines[7] == "first, official: mean absolute difference from our picture 0"
-    monkeypatch.setattr(sys, "argv", ["table.py", "scene.npz"])
     with pytest.raises(SystemExit):
-        table.main()
+        run(table, "scene.npz")
     assert "must be LABEL=SCENE,VIEWS, got scene.npz" in capsys.readouterr().err
 
 
-def run_scaling(monkeypatch, device, folder, *options):
-    """What scaling.py writes for 100 and 400 Gaussians and for three sizes."""
-    scaling = importlib.import_module("scaling")
+def run_scaling(run, device, folder, *options):
+    """What scaling.py prints and writes for 100 and 400 Gaussians and for three sizes."""
     given = ["--gaussians", "1e2,4e2", "--size", "96x64", "--sizes", "48x32,96x64,192x128", "--rounds", "1"]
-    given += ["--density", "0.05", "--count", "200", "--device", device, "--json", str(folder / "out.json"), *options]
-    monkeypatch.setattr(sys, "argv", ["scaling.py", *given])
-    scaling.main()
-    return json.loads((folder / "out.json").read_text())
+    given += ["--density", "0.05", "--count", "200", "--device", device, "--json", folder / "out.json", *options]
+    return run(importlib.import_module("scaling"), *given), written(folder)
 
 
-def test_scaling(device, tmp_path, monkeypatch, capsys):
+def test_scaling(device, tmp_path, run):
     """Two series whose pairs grow as the Gaussians do, and the figure of them."""
     pytest.importorskip("matplotlib", reason="needs the analysis extra")
-    written = run_scaling(monkeypatch, device, tmp_path, "--threads", "1", "--out", str(tmp_path / "figures"))
-    rows = written["rows"]
+    printed, found = run_scaling(run, device, tmp_path, "--threads", "1", "--out", tmp_path / "figures")
+    rows = found["rows"]
     assert [row["gaussians"] for row in rows] == [100, 400, 77, 307, 1229]
     assert [row["series"] for row in rows] == ["gaussians"] * 2 + ["pixels"] * 3
     for row in rows:
@@ -320,13 +307,13 @@ def test_scaling(device, tmp_path, monkeypatch, capsys):
         assert all(math.isfinite(value) for value in row.values() if not isinstance(value, str))
         assert min(row["project"], row["list_tiles"], row["blend"], row["memory_bytes"]) > 0
     assert rows[1]["pairs"] / rows[0]["pairs"] == pytest.approx(4, rel=0.1)
-    assert written["threads"] == {}
-    lines = capsys.readouterr().out.splitlines()
+    assert found["threads"] == {}
+    lines = printed.splitlines()
     assert [line.split()[2] for line in lines[3:8]] == ["96x64", "96x64", "48x32", "96x64", "192x128"]
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["scaling.png", "scaling.svg"]
 
 
-def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatch, capsys):
+def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatch, run):
     """A row, not the end of the program; any other error ends it."""
     scaling = importlib.import_module("scaling")
     original = scaling.make_case
@@ -339,30 +326,30 @@ def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatc
         return original(args, count, size)
 
     monkeypatch.setattr(scaling, "make_case", make_case)
-    rows = run_scaling(monkeypatch, device, tmp_path, "--threads", "1")["rows"]
-    assert ["error" in row for row in rows] == [False, True, False, True, False]
-    assert rows[1]["error"] == "out of memory: no room"
-    assert sum("out of memory" in line for line in capsys.readouterr().out.splitlines()) == 2
+    printed, found = run_scaling(run, device, tmp_path, "--threads", "1")
+    assert ["error" in row for row in found["rows"]] == [False, True, False, True, False]
+    assert found["rows"][1]["error"] == "out of memory: no room"
+    assert sum("out of memory" in line for line in printed.splitlines()) == 2
 
     def fail(*_):
         raise RuntimeError("something else")
 
     monkeypatch.setattr(scaling, "make_case", fail)
     with pytest.raises(RuntimeError, match="something else"):
-        run_scaling(monkeypatch, device, tmp_path, "--threads", "1")
+        run_scaling(run, device, tmp_path, "--threads", "1")
 
 
-def test_scaling_with_threads(tmp_path, monkeypatch, capsys):
+def test_scaling_with_threads(tmp_path, monkeypatch, run):
     """A row for every number of threads, timed with that many in turn; the other rows with the largest."""
     pytest.importorskip("matplotlib", reason="needs the analysis extra")
     asked = []  # and not set: threads that wait for each other take long on a busy machine
     monkeypatch.setattr(torch, "set_num_threads", asked.append)
-    options = ["--threads", "1,2", "--gaussians", "50", "--sizes", "48x32", "--out", str(tmp_path / "figures")]
-    written = run_scaling(monkeypatch, "cpu", tmp_path, *options)
+    options = ["--threads", "1,2", "--gaussians", "50", "--sizes", "48x32", "--out", tmp_path / "figures"]
+    printed, found = run_scaling(run, "cpu", tmp_path, *options)
     assert asked == [2, 1, 2, 1, 2, 2]  # at first, in a round that warms up, in the timed one, and at the end
-    assert list(written["threads"]) == ["1", "2"]
-    assert all(0 < value["forward"] < math.inf for value in written["threads"].values())
-    assert "200 Gaussians, 96x64" in capsys.readouterr().out
+    assert list(found["threads"]) == ["1", "2"]
+    assert all(0 < value["forward"] < math.inf for value in found["threads"].values())
+    assert "200 Gaussians, 96x64" in printed
     assert {path.name for path in (tmp_path / "figures").iterdir()} >= {"scaling.png", "threads.png", "threads.svg"}
 
 
@@ -378,9 +365,8 @@ def test_synthetic_splats_keep_their_size():
         # Off the axis by x / z, at most half a width over four widths, a splat is sqrt(1 + (x / z)^2) times as wide.
         widest = 1 + 0.125**2
         for variance in (cov_xx, cov_yy):
-            assert (variance / scaling.SIGMA**2 >= 1 - 1e-4).all() and (
-                variance / scaling.SIGMA**2 < widest + 1e-4
-            ).all()
+            share = variance / scaling.SIGMA**2
+            assert (share >= 1 - 1e-4).all() and (share < widest + 1e-4).all()
         assert (splats.means2d.amax(0) > 0.95 * torch.tensor([width, height])).all()
 
 
@@ -389,7 +375,7 @@ def test_losses(device, tmp_path, run):
     losses = importlib.import_module("losses")
     options = ["--sizes", "20x10", "--gaussians", "30", "--rounds", "1", "--threads", "1", "--device", device]
     table = run(losses, *options, "--json", str(tmp_path / "out.json"))
-    results = json.loads((tmp_path / "out.json").read_text())["results"]
+    results = written(tmp_path)["results"]
     assert len(results) == 11
     for name, result in results.items():
         assert f"| {name} |" in table
@@ -414,10 +400,9 @@ def test_busy(tmp_path, monkeypatch, run):
     monkeypatch.setattr(torch, "set_num_threads", ask)
     options = ["--loops", "2", "--threads", "2", "--gaussians", "30", "--sizes", "20x10", "--rounds", "1"]
     table = run(busy, *options, "--json", str(tmp_path / "out.json"))
-    rows = json.loads((tmp_path / "out.json").read_text())["results"]
-    assert [(row["pass"], row["loops"]) for row in rows] == [
-        (name, loops) for loops in (0, 2) for name in ("forward", "with backward")
-    ]
+    rows = written(tmp_path)["results"]
+    expected = [(name, loops) for loops in (0, 2) for name in ("forward", "with backward")]
+    assert [(row["pass"], row["loops"]) for row in rows] == expected
     assert asked == [1, 2, 1, 2, torch.get_num_threads()] * 4
     assert alive == [0] * 10 + [2] * 10
     assert len(started) == 2 and all(loop.returncode for loop in started)
@@ -426,66 +411,49 @@ def test_busy(tmp_path, monkeypatch, run):
         assert f"| {row['size']} | {row['pass']} | {row['loops']} |" in table
 
 
-def test_training(device, tmp_path, monkeypatch, capsys):
-    """A row for every variant, and a run for every variant and seed, on pictures of noise."""
-    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+def test_training(device, tmp_path, run):
+    """A row for every variant, and a run for every variant and seed."""
+    pytest.importorskip("PIL.Image", reason="needs the train extra")
     pytest.importorskip("scipy", reason="needs the train extra")
     training = importlib.import_module("training")
-    pixels = torch.randint(256, (16, 16, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
-    image.fromarray(pixels).save(tmp_path / "a.png")
-    frames = []
-    for x in (0.0, 1.0):
-        pose = torch.eye(4)
-        pose[0, 3], pose[2, 3] = x, 4.0
-        frames.append({"file_path": "a", "transform_matrix": pose.tolist()})
-    for split in ("train", "test"):
-        content = {"camera_angle_x": 0.7, "frames": frames}
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
+    write_nerf_synthetic(tmp_path, circle(2, (16, 16)), circle(2, (16, 16)))
     (tmp_path / "more.json").write_text(json.dumps({"mine": {"scale_repeats": [3, 1, 1, 1], "density": "mcmc"}}))
     arguments = [tmp_path, "--more", tmp_path / "more.json", "--json", tmp_path / "out.json", "--device", device]
     names = ["default", "mine", "3dgs"]
     options = ["--variants", *names, "--seeds", "0", "1", "--scales", "1,2", "--iterations", "12"]
-    monkeypatch.setattr(sys, "argv", ["training.py", *map(str, arguments), *options, "--random-points", "20"])
-    assert training.main() == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(training, *arguments, *options, "--random-points", "20", code=0).splitlines()
     assert [line.split()[0] for line in lines[2:]] == names and all("±" in line for line in lines[2:])
-    runs = json.loads((tmp_path / "out.json").read_text())["runs"]
+    runs = written(tmp_path)["runs"]
     assert [(run["variant"], run["seed"]) for run in runs] == [(v, s) for s in (0, 1) for v in names]
     assert all(run["steps"] == 12 and math.isfinite(run["test"]["mean"]["psnr"]) for run in runs)
     assert runs[1]["options"]["scale_repeats"] == [3, 1]
     assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([1, 1], "3dgs")
-    monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path), "--variants", "none"])
-    assert training.main() == 2
+    run(training, tmp_path, "--variants", "none", code=2)
     (tmp_path / "transforms_test.json").unlink()
-    monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path)])
-    capsys.readouterr()
-    assert training.main() == 2  # before anything is trained
-    assert capsys.readouterr().err == f"error: {tmp_path}: there are no test pictures\n"
+    run(training, tmp_path, code=2)  # before anything is trained
+    assert run.err == f"error: {tmp_path}: there are no test pictures\n"
 
 
-def test_gsplat_training(tmp_path, monkeypatch, capsys):
+def test_gsplat_training(tmp_path, monkeypatch, run):
     """Its strategy grows Gaussians from our call, and the error of the pictures falls; what is missing is said."""
     program = importlib.import_module("gsplat_training")
-    arguments = [str(tmp_path), "--device", "cpu", "--random-points", "300", "--json", str(tmp_path / "out.json")]
-    monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments])
+    arguments = [tmp_path, "--device", "cpu", "--random-points", "300", "--json", tmp_path / "out.json"]
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "gsplat", None)
-        assert program.main() == 2
-    assert capsys.readouterr().err.startswith("error: gsplat, whose strategy this runs, is not installed")
+        run(program, *arguments, code=2)
+    assert run.err.startswith("error: gsplat, whose strategy this runs, is not installed")
     pytest.importorskip("gsplat", reason="needs gsplat")
     pytest.importorskip("PIL.Image", reason="needs the train extra")
     pytest.importorskip("scipy", reason="needs the train extra")
-    monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, "--rasterizer", "gsplat"])
-    assert program.main() == 2 and capsys.readouterr().err == "error: --rasterizer gsplat: needs CUDA\n"
+    run(program, *arguments, "--rasterizer", "gsplat", code=2)
+    assert run.err == "error: --rasterizer gsplat: needs CUDA\n"
     write_nerf_synthetic(tmp_path, circle(3), circle(2))
     found = {}
     for steps, options in ((1, []), (60, []), (20, ["--packed", "--absgrad", "--antialiased"])):
-        options = [*options, "--iterations", str(steps), "--refine-start", "5", "--refine-every", "10"]
-        monkeypatch.setattr(sys, "argv", ["gsplat_training.py", *arguments, *options])
-        assert program.main() == 0
-        [header, row] = capsys.readouterr().out.splitlines()[1:]
+        options = [*options, "--iterations", steps, "--refine-start", "5", "--refine-every", "10"]
+        [header, row] = run(program, *arguments, *options, code=0).splitlines()[1:]
         assert header.split()[:4] == ["rasterizer", "seconds", "PSNR", "Gaussians"] and row.split()[0] == "ours"
-        found[steps] = json.loads((tmp_path / "out.json").read_text())["runs"]["ours"]
+        found[steps] = written(tmp_path)["runs"]["ours"]
     assert found[60]["psnr"] > found[1]["psnr"] and found[60]["gaussians"] != found[1]["gaussians"] == 300
 
 
@@ -498,29 +466,29 @@ def run_on_ranks(name, small_scene, *options):
         env=os.environ | {"PYTHONPATH": python_path()},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout, json.loads((small_scene / "out.json").read_text())
+    return done.stdout, written(small_scene)
 
 
 def test_distributed(small_scene):
     """Measured numbers for every number of ranks, and the model's for more; as many bytes as the formula says."""
-    printed, written = run_on_ranks("distributed.py", small_scene, "--times", "3")
+    printed, found = run_on_ranks("distributed.py", small_scene, "--times", "3")
     rows = [line.split() for line in printed.splitlines()[4:]]
     assert [row[0] for row in rows] == ["1", "2", "4", "8", "64"] and {len(row) for row in rows} == {10}
     assert all(cell != "-" for row in rows[:2] for cell in row) and rows[2][1:8] == ["-"] * 7
-    assert all(math.isfinite(value) for of_ranks in written["results"].values() for value in of_ranks.values())
-    one, two = (written["results"][ranks] for ranks in ("1", "2"))
+    assert all(math.isfinite(value) for of_ranks in found["results"].values() for value in of_ranks.values())
+    one, two = (found["results"][ranks] for ranks in ("1", "2"))
     assert one["sent"] == one["exchange"] == 0 < two["exchange"] and one["state_bytes"] == 2 * two["state_bytes"]
     assert one["peak_bytes"] > one["state_bytes"] and two["peak_bytes"] > two["state_bytes"]
     # Exact where each rank has half of the splats of each camera; here each has at most all of them.
-    assert 0 < two["sent"] <= 2 * written["model"]["2"]["sent"]
-    assert written["model"]["64"]["images_per_second"] > written["model"]["4"]["images_per_second"] > 0
+    assert 0 < two["sent"] <= 2 * found["model"]["2"]["sent"]
+    assert found["model"]["64"]["images_per_second"] > found["model"]["4"]["images_per_second"] > 0
 
 
 def test_bands(small_scene):
     """A row for every number of ranks; two of them hold half of the scene each, and the last all of the image."""
-    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scales", "0.0625")
+    printed, found = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scales", "0.0625")
     assert "in 2 copies: 300\n" in printed
-    one, two = (written["results"][ranks] for ranks in ("1", "2"))
+    one, two = (found["results"][ranks] for ranks in ("1", "2"))
     assert min(*one.values(), *two.values()) > 0
     assert one["scene_bytes"] == 2 * two["scene_bytes"]
     if added_memory(lambda: torch.ones(2**20), torch.device("cpu"))[1] > 0:  # where memory can be measured
@@ -551,7 +519,7 @@ def test_formats(small_scene, run):
     io.save_scene(small_scene / "other.ply", scene_files.load_scene(small_scene / "scene.npz"))
     options = ["--also", str(small_scene / "other.ply"), "--device", "cpu", "--footprint", "box:samples=1"]
     table = run(benchmark, *files_of(small_scene), *options)
-    results = {row["file"]: row for row in json.loads((small_scene / "out.json").read_text())["results"]}
+    results = {row["file"]: row for row in written(small_scene)["results"]}
     assert list(results) == [*(f"scene.{suffix}" for suffix in benchmark.FORMATS), "other.ply"]
     assert all(f"| {name.removeprefix('scene')} |" in table for name in results)
     assert results["scene.ply"]["psnr"] == results["other.ply"]["psnr"] == 300
@@ -564,7 +532,7 @@ def test_approximations(small_scene, run):
     benchmark = importlib.import_module("approximations")
     options = ["--scales", "1", "--crop", "24", "20", "--samples", "2", "--limit-views", "1", "--threads", "1"]
     assert "| a | 1/1 |" in run(benchmark, *files_of(small_scene), *options)
-    [result] = json.loads((small_scene / "out.json").read_text())["results"]
+    [result] = written(small_scene)["results"]
     # One of the 1920 samples on the other side of a threshold by rounding: 1/255/4 in one of 480 pixels.
     assert result["library"] > -20 * math.log10(1 / 255 / 4 / math.sqrt(480))
     changed = [name for name in benchmark.VARIANTS if name != "0.9999"]
@@ -622,14 +590,13 @@ def test_order_of_each_ray(small_scene):
     assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])
 
 
-def test_lens_accuracy(tmp_path, small_scene, monkeypatch, run):
+def test_lens_accuracy(tmp_path, small_scene, run):
     """Rows with numbers; the library's samples are the program's; pictures; the number predicts errors of weights."""
     benchmark = importlib.import_module("lens_accuracy")
     sizes = ["--size", "24", "16", "--samples", "2", "--gaussians", "60", "--threads", "1", "--fovs", "90", "150"]
     options = ["--sigmas", "2", "--scenes", "1", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "out.json")]
-    monkeypatch.setattr(sys, "argv", ["lens_accuracy.py", *sizes, *options])
-    benchmark.main()
-    results = json.loads((tmp_path / "out.json").read_text())
+    run(benchmark, *sizes, *options)
+    results = written(tmp_path)
     rows = {(row["camera"], row["field of view"]): row for row in results["pictures"]}
     assert list(rows) == [("fisheye", "90"), ("perspective", "90"), ("pinhole", "90"), ("fisheye", "150")]
     assert all(math.isfinite(row[name]) for row in rows.values() for name in ("affine", *benchmark.FOOTPRINTS, "above"))
@@ -704,18 +671,16 @@ def test_timeline_of_a_trace(small_scene):
     assert timeline.kernels_of({"traceEvents": []}) == []
 
 
-def test_timeline(small_scene, monkeypatch, capsys):
+def test_timeline(small_scene, capsys, run):
     """Also without a device, where it says so."""
     timeline = importlib.import_module("timeline")
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--view", 1, "--sh-degree", 3]
-    monkeypatch.setattr(sys, "argv", ["timeline.py", *map(str, arguments)])
     if not torch.cuda.is_available() or not ar._C.has_cuda:
         with pytest.raises(SystemExit):
-            timeline.main()
+            run(timeline, *arguments)
         assert "no CUDA device" in capsys.readouterr().err
         return
-    timeline.main()
-    printed = capsys.readouterr().out
+    printed = run(timeline, *arguments)
     for footprint in timeline.FOOTPRINTS:
         assert footprint in printed
     for kernel in ("project_kernel", "blend", "project_vjp_kernel"):
@@ -735,14 +700,14 @@ def test_viewer_gpu(small_scene, run):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    shaders, job, written = (small_scene / name for name in ("shaders.json", "job.npz", "out.json"))
+    shaders, job, file = (small_scene / name for name in ("shaders.json", "job.npz", "out.json"))
     given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
     run(benchmark, "--write-shaders", shaders)
     run(benchmark, *given, "--shaders", shaders, "--prepare", job)
-    rounds = ["--rounds", "2", "--json", written]
+    rounds = ["--rounds", "2", "--json", file]
     for scene in (given, [job]):
         out = run(benchmark, *scene, *rounds)
-        results = json.loads(written.read_text())
+        results = written(small_scene)
         assert list(results["differences"]) == list(pages.WEBGL_FOOTPRINTS)
         for name, of_bits in results["differences"].items():
             assert f"| {name} " in out
@@ -757,7 +722,7 @@ def test_viewer_gpu(small_scene, run):
     prepared = benchmark.Job.load(job)
     dataclasses.replace(prepared, expected=lambda _: prepared.expected("point")).save(job, ["analytic"])
     run(benchmark, job, *rounds, "--footprints", "analytic")
-    assert json.loads(written.read_text())["differences"]["analytic"]["32-bit floats"]["largest"] > 1
+    assert written(small_scene)["differences"]["analytic"]["32-bit floats"]["largest"] > 1
 
 
 def test_viewer_webgpu(small_scene, monkeypatch, run):
@@ -774,48 +739,44 @@ def test_viewer_webgpu(small_scene, monkeypatch, run):
     except SystemExit as error:
         pytest.skip(str(error))
 
-    plan, job, written = (small_scene / name for name in ("plan.json", "job.npz", "out.json"))
+    plan, job, file = (small_scene / name for name in ("plan.json", "job.npz", "out.json"))
     scene = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
     names = ["analytic", "moment:samples=4", "mip:variance=0.3"]
     options = ["--footprints", *names, "--timed", "moment:samples=4", "--rounds", "2", "--repeat", "2"]
     run(benchmark, *scene, *options, "--write-plan", plan)
     run(benchmark, *scene, *options, "--plan", plan, "--prepare", job)
     for given in ([*scene, "--plan", plan], [job]):
-        out = run(benchmark, *given, *options, "--json", written)
-        results = json.loads(written.read_text())
+        out = run(benchmark, *given, *options, "--json", file)
+        results = written(small_scene)
         assert list(results["differences"]) == names
         for name, found in results["differences"].items():
             assert f"  {name}: largest difference" in out
             assert found["largest"] <= 1 and found["changed"] == 0 and found["values"] == 2 * 3 * 40 * 30
-        assert [(row["size"], row["footprint"]) for row in results["rows"]] == [
-            ("40x30", "moment:samples=4"),
-            ("20x15", "moment:samples=4"),
-        ]
+        expected = [(size, "moment:samples=4") for size in ("40x30", "20x15")]
+        assert [(row["size"], row["footprint"]) for row in results["rows"]] == expected
         for row in results["rows"]:
             assert row["clock"] > 0 and row["pairs"] > 0 and len(row["views"]) == 2
 
     prepared = benchmark.Job.load(job)
     dataclasses.replace(prepared, expected=lambda _: prepared.expected("mip:variance=0.3")).save(job, names)
-    run(benchmark, job, *options, "--json", written)
-    assert json.loads(written.read_text())["differences"]["analytic"]["largest"] > 1
+    run(benchmark, job, *options, "--json", file)
+    assert written(small_scene)["differences"]["analytic"]["largest"] > 1
     with pytest.raises(SystemExit, match="another number of Gaussians, other views or other sizes"):
         run(benchmark, *scene[:-1], "40x30", *options, "--plan", plan)
     with pytest.raises(SystemExit, match="has no point at 40x30"):
         run(benchmark, *scene, *options, "--plan", plan, "--footprints", "point")
 
 
-def test_every_kernel(device, monkeypatch, capsys):
+def test_every_kernel(device, monkeypatch, run):
     """The program for compute-sanitizer ends; the parts that render footprints are alike, so that one will do here."""
     program = importlib.import_module("every_kernel")
     of_footprints = [scenes.name_of(variant) for variant in scenes.VARIANTS if scenes.name_of(variant) != "box-4"]
     for name in (*of_footprints, "largest"):
         monkeypatch.delitem(program.PARTS, name)
     parts = list(program.PARTS)  # so that it is an error if one of the operators is not called
-    monkeypatch.setattr(sys, "argv", ["every_kernel.py", *parts, "--device", device])
     if device == "cuda":  # where kernels of the parts that are left out must be launched as well
         monkeypatch.setattr(program, "kernels_of_library", lambda: set(_C.launched_kernels()))
-    program.main()
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(program, *parts, "--device", device).splitlines()
     assert [line for line in lines if line in parts] == parts
     assert device == "cpu" or lines[-1].endswith(" kernels were launched")
 
@@ -852,7 +813,7 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100
 
 
-def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
+def test_lens_training(tmp_path, small_scene, run):
     """Its formulas are those of the library, a photograph is the library's picture, and every training has a number."""
     pytest.importorskip("PIL.Image", reason="needs the train extra")
     program = importlib.import_module("lens_training")
@@ -883,16 +844,14 @@ def test_lens_training(tmp_path, small_scene, monkeypatch, capsys):
         each.w2c[0, 3] += 0.1 * k
     io.save_views(small_scene / "views.json", views)
     given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--out", tmp_path / "out"]
-    options = ["--iterations", "2", "--points", "30", "--device", "cpu"]
-    monkeypatch.setattr(sys, "argv", ["lens_training.py", *map(str, given), *options])
-    program.main()
+    printed = run(program, *given, "--iterations", "2", "--points", "30", "--device", "cpu")
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(results) == ["pinhole, keep", "opencv, keep", "opencv, undistort", "fisheye, keep"]
     assert all(math.isfinite(value) for values in results.values() for value in values)
-    assert "| fisheye, keep |" in capsys.readouterr().out
+    assert "| fisheye, keep |" in printed
 
 
-def test_large_capture(tmp_path, monkeypatch, capsys):
+def test_large_capture(tmp_path, monkeypatch, run):
     """The photographs are those of the cameras, and trainings from every place have a row, and the same bits."""
     numpy = pytest.importorskip("numpy")
     pytest.importorskip("tqdm", reason="needs the train extra")
@@ -903,9 +862,7 @@ def test_large_capture(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(program, "WARM_UP", 2)
     sizes = ["--count", "5", "--size", "64x48", "--points", "300", "--steps", "6", "--scales", "1,2"]
     options = ["--footprint", "box:samples=1", "--device", "cpu", "--threads", "1", "--folder", folder]
-    monkeypatch.setattr(sys, "argv", ["large_capture.py", *sizes, *map(str, options), "--json", str(results)])
-    assert program.main() == 0
-    assert "the trained Gaussians have the same bits" in capsys.readouterr().out
+    assert "the trained Gaussians have the same bits" in run(program, *sizes, *options, "--json", results, code=0)
     on_device, in_files = json.loads(results.read_text())["places"]
     assert on_device["ahead"] == 0 < in_files["ahead"]
     whole = sum(3 * (64 // scale) * (48 // scale) for scale in (1, 2) for _ in range(5)) / 2**30
@@ -922,7 +879,7 @@ def test_large_capture(tmp_path, monkeypatch, capsys):
         assert within.sum() > 50 and error < 0.05 < abs(pixels - pixels.mean(0)).mean()
 
 
-def test_capture_effects(tmp_path, monkeypatch, capsys):
+def test_capture_effects(tmp_path, run):
     """Copies have what their docstring says, and every training a row. The numbers mean nothing."""
     pytest.importorskip("tqdm", reason="needs the train extra")
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
@@ -930,11 +887,8 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
     effects = importlib.import_module("capture_effects")
     wall.write_wall(tmp_path / "wall")
     options = ["--iterations", "2", "--device", "cpu", "--stops", "0.8", "--balance", "0", "--footprints", "box"]
-    arguments = ["capture_effects.py", str(tmp_path / "wall"), "--out", str(tmp_path / "out"), *options]
-    monkeypatch.setattr(sys, "argv", arguments)
     with pytest.warns(UserWarning, match="train_0004.png is left out"):
-        effects.main()
-    table = capsys.readouterr().out
+        table = run(effects, tmp_path / "wall", "--out", tmp_path / "out", *options)
     runs = json.loads((tmp_path / "out" / "results.json").read_text())["runs"]
     assert [run["row"] for run in runs] == list(effects.ROWS) and all(f" {name} " in table for name in effects.ROWS)
     taken = {run["row"]: run["taken"] for run in runs}
@@ -958,13 +912,12 @@ def test_capture_effects(tmp_path, monkeypatch, capsys):
     assert min(factors) < 0.85 and max(factors) > 1.15
 
 
-def test_room(tmp_path, monkeypatch):
+def test_room(tmp_path, run):
     """Its photographs show the points where the cameras say, in their colours."""
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
     program = importlib.import_module("room")
     folder = tmp_path / "room"
-    monkeypatch.setattr(sys, "argv", ["room.py", str(folder), "--count", "4", "--size", "60x40", "--points", "200"])
-    program.main()
+    run(program, folder, "--count", "4", "--size", "60x40", "--points", "200")
     capture = training.load_capture(folder, test_every=0)
     points, colors = capture.points
     assert len(capture.train) == 4 and len(points) == 200
