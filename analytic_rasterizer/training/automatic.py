@@ -62,6 +62,10 @@ def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[s
     of_options = {name: value for name, value in taken.items() if name not in of_source}
     if "scales" in of_options:
         of_options["scale_repeats"] = ()  # as is usual for these
+    beginning = plan.beginning(options.footprint, of_options.get("scales", options.scales))
+    beginning = {n: v for n, v in beginning.items() if n not in chosen and given[n] == defaults[n]}
+    if "first_footprint" in beginning:
+        taken, of_options = taken | beginning, of_options | beginning
     lines = []
     if ranks.is_first:
         lines = [*plan.to_lines(), f"--effects auto takes {as_words(taken) or 'nothing'}"]

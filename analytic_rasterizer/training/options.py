@@ -11,6 +11,7 @@ from ..declared import add_attributes, declared, settled
 from ..density import GradientOptions, MonteCarloOptions
 from .parts import (
     FINEST_REPEATS,
+    NO_FOOTPRINT,
     GradientGrowth,
     GrowthOptions,
     LengthOptions,
@@ -250,6 +251,11 @@ class TrainingOptions:
         """Weights of mean opacity and mean scale, settled."""
         usual = 0.01 if self.density == "mcmc" else 0.0
         return tuple(usual if weight == -1 else weight for weight in (self.opacity_weight, self.scale_weight))
+
+    @property
+    def begins_with(self) -> str | None:
+        """The footprint until `footprint_from`; None: there is no other than `footprint`."""
+        return None if self.first_footprint in ("", NO_FOOTPRINT, self.footprint) else self.first_footprint
 
     @classmethod
     def preset(cls, name: str, **given: Any) -> TrainingOptions:

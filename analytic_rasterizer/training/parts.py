@@ -19,6 +19,7 @@ EFFECTS = ("auto", "none")
 EXPOSURES = ("none", "affine")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 RANDOM_BACKGROUND = "random"
+NO_FOOTPRINT = "none"  # of the beginning, other than that of the end
 
 RANDOM_POINTS = 100_000  # by default, where the limit of Gaussians is not below that
 FINEST_REPEATS = 2  # how often the finest of several scales occurs by default, where the others occur once
@@ -74,8 +75,8 @@ class SceneOptions(Options):
     )
     first_footprint: str = option(
         "",
-        "Footprint until `footprint_from`, cheaper than the one that is trained for. Without any: `footprint` from the "
-        "start. `effects` may choose it.",
+        'Footprint until `footprint_from`, cheaper than the one that is trained for. "none": `footprint` from the start. '
+        "Without any: as `effects` find.",
         metavar="NAME[:k=v,..]",
         main=True,
     )
@@ -94,9 +95,9 @@ class SceneOptions(Options):
     filter_3d: bool = option(False, "Whether Gaussians are widened by the 3D filter of Mip-Splatting.", main=True)
 
     def __post_init__(self):
-        for name in ("footprint", "first_footprint"):
-            value = str(getattr(self, name))
-            object.__setattr__(self, name, str(resolve_footprint(value)) if value or name == "footprint" else "")
+        object.__setattr__(self, "footprint", str(resolve_footprint(str(self.footprint))))
+        if self.first_footprint not in ("", NO_FOOTPRINT):
+            object.__setattr__(self, "first_footprint", str(resolve_footprint(str(self.first_footprint))))
         super().__post_init__()
 
 

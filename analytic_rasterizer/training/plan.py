@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .. import io
+from ..footprints import RECOMMENDED, resolve_footprint
 from . import colmap
 from .captures import IMAGES, check_capture, lens_models, read_cameras
 from .evidence import (
@@ -51,6 +52,11 @@ GRID = 17  # points along each side of a picture, where lenses are measured
 NAMED = 5  # photographs in a line
 
 SCALES = (1, 2, 4, 8)
+
+# While shapes are being found, one sample in a pixel does as well as many: until such a share of the training, where
+# photographs have one size, and where edges are finer than a pixel (docs/internals/training.md).
+CHEAP, CHEAP_UNTIL, CHEAP_UNTIL_FINE = "box:samples=1", 0.9, 0.5
+DEAR = ("analytic", "box", "moment")  # footprints that integrate over the same pixel
 
 
 @dataclass(frozen=True)
@@ -120,6 +126,17 @@ class CapturePlan:
         called_for = (finding.options for finding in self.findings if finding.verdict == YES)
         return {name: value for options in called_for for name, value in options.items()}
 
+    def beginning(self, footprint: str, scales: Sequence[int]) -> dict[str, Any]:
+        """Options of `train` for a cheaper footprint at the beginning, where a training for `footprint` may have one.
+
+        Args:
+            scales: Of the training. Pictures of several sizes, or with alpha, show edges finer than a pixel.
+        """
+        if resolve_footprint(footprint).name not in DEAR or footprint == CHEAP:
+            return {}
+        fine = len(scales) > 1 or any(f.effect == "alpha" and f.verdict == YES for f in self.findings)
+        return {"first_footprint": CHEAP, "footprint_from": CHEAP_UNTIL_FINE if fine else CHEAP_UNTIL}
+
     def to_lines(self) -> list[str]:
         """A line of what was looked at, then one for each finding: the first lines of `train`."""
         looked = f"looked at {self.looked_at} of {self.photographs} photographs, at up to {LARGEST} px"
@@ -127,7 +144,14 @@ class CapturePlan:
 
     def to_text(self) -> str:
         """`to_lines`, and the options."""
-        return "\n".join([*self.to_lines(), f"calls for: {as_words(self.options) or 'nothing special'}"])
+        beginning = self.beginning(RECOMMENDED, self.options.get("scales", (1,)))
+        return "\n".join(
+            [
+                *self.to_lines(),
+                f"calls for: {as_words(self.options) or 'nothing special'}",
+                f"may begin with: {as_words(beginning)}",
+            ]
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Everything but `stops`, as JSON holds it; options in words."""

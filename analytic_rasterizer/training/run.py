@@ -278,7 +278,7 @@ class Run:
             "psnr": None if math.isnan(quality) else quality,  # where nothing counts there is none
             "gaussians": self.count(),
             "dropped": self.trainer.dropped,
-            **({"footprint": self.trainer.footprint} if self.options.first_footprint else {}),
+            **({"footprint": self.trainer.footprint} if self.options.begins_with else {}),
         }
         self.history.append(entry)
         if self.ranks.is_first:

@@ -110,7 +110,7 @@ def footprint_at(step: int, share: float, options: TrainingOptions) -> str:
     """The footprint in use after so many steps."""
     time = options.footprint_from
     over = step >= time if time > 1 else share >= time
-    return options.footprint if over or not options.first_footprint else options.first_footprint
+    return options.footprint if over or options.begins_with is None else options.begins_with
 
 
 def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:

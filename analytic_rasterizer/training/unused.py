@@ -44,10 +44,8 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
         note(["gradient_scales"], "there is one scale")
         if options.scales == (1,):
             note(["downsampling"], "the pictures are trained on at their full size")
-    if not options.first_footprint:
-        note(["footprint_from"], "the footprint is the same from the start (first_footprint)")
-    if options.first_footprint == options.footprint:
-        note(["first_footprint", "footprint_from"], f"the footprint is {options.footprint} all the time")
+    if options.begins_with is None:
+        note(["footprint_from"], f"the footprint is {options.footprint} from the start")
     if options.sh_degree == 0:
         note(["sh_every"], "sh_degree is 0")
     if options.rates_half_life == 0:
