@@ -18,6 +18,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import io, training
 
 FOOTPRINT = "moment:samples=4"
+FIRST, FIRST_SHARE = "box:samples=1", 0.9  # one sample is quicker, and enough while shapes are being found
 
 
 def own_pictures(device):
@@ -49,7 +50,8 @@ def train(pictures, points, steps, options):
     generator, losses = torch.Generator().manual_seed(0), []
     for step in range(1, steps + 1):
         i = int(torch.randint(len(pictures.views), (1,), generator=generator))
-        settings = pictures.settings[1][i]._replace(footprint=FOOTPRINT, sh_degree=min(3, 8 * step // steps))
+        footprint = FIRST if step <= FIRST_SHARE * steps else FOOTPRINT
+        settings = pictures.settings[1][i]._replace(footprint=footprint, sh_degree=min(3, 8 * step // steps))
         leaf = control.leaf()  # gets the gradients of the projected means
         picture, radii = ar.GaussianRasterizer(settings)(means2D=leaf, **control.gaussians.arguments())
         loss = ar.losses.l1_ssim(picture, pictures.target(1, i))

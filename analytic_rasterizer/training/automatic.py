@@ -62,10 +62,11 @@ def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[s
     of_options = {name: value for name, value in taken.items() if name not in of_source}
     if "scales" in of_options:
         of_options["scale_repeats"] = ()  # as is usual for these
-    beginning = plan.beginning(options.footprint, of_options.get("scales", options.scales))
+    begun = replace(options, **of_options)
+    beginning = plan.beginning(begun.footprint, begun.scales)
     beginning = {n: v for n, v in beginning.items() if n not in chosen and given[n] == defaults[n]}
     if "first_footprint" in beginning:
-        taken, of_options = taken | beginning, of_options | beginning
+        begun = replace(begun, **beginning)
     lines = []
     if ranks.is_first:
         lines = [*plan.to_lines(), f"--effects auto takes {as_words(taken) or 'nothing'}"]
@@ -75,7 +76,16 @@ def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[s
         refused = {name: values[name] for name in alone if name in values}
         if refused:
             lines[-1] += f", and not {as_words(refused)}, which {ranks.world} processes cannot learn: train on one"
-    return Settled(replace(options, **of_options), replace(source, **of_source), taken, lines, [], plan.stops)
+        if "first_footprint" in beginning:
+            lines.append(
+                f"begins with {begun.first_footprint}, and goes on with {begun.footprint} when "
+                f"{_time(begun.footprint_from)} over (--first-footprint none: does not)"
+            )
+    return Settled(begun, replace(source, **of_source), taken, lines, [], plan.stops)
+
+
+def _time(time: float) -> str:
+    return f"{time:.0%} is" if time <= 1 else f"{time:,.0f} steps are"
 
 
 @contextmanager

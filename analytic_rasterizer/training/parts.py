@@ -75,8 +75,8 @@ class SceneOptions(Options):
     )
     first_footprint: str = option(
         "",
-        'Footprint until `footprint_from`, cheaper than the one that is trained for. "none": `footprint` from the start. '
-        "Without any: as `effects` find.",
+        "Footprint until `footprint_from`, cheaper than the one that is trained for. "
+        '"none": `footprint` from the start. Without any: as `effects` find.',
         metavar="NAME[:k=v,..]",
         main=True,
     )

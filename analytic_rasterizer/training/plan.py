@@ -144,14 +144,9 @@ class CapturePlan:
 
     def to_text(self) -> str:
         """`to_lines`, and the options."""
-        beginning = self.beginning(RECOMMENDED, self.options.get("scales", (1,)))
-        return "\n".join(
-            [
-                *self.to_lines(),
-                f"calls for: {as_words(self.options) or 'nothing special'}",
-                f"may begin with: {as_words(beginning)}",
-            ]
-        )
+        begins = as_words(self.beginning(RECOMMENDED, self.options.get("scales", (1,))))
+        wanted = as_words(self.options) or "nothing special"
+        return "\n".join([*self.to_lines(), f"training begins with: {begins}", f"calls for: {wanted}"])
 
     def to_json(self) -> dict[str, Any]:
         """Everything but `stops`, as JSON holds it; options in words."""

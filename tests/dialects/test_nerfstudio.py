@@ -34,8 +34,11 @@ FILES = {
             refine_every: int = 100
             rasterize_mode: str = "classic"
         class SplatfactoModel:
+            training, step = True, 0
             def __init__(self, config):
                 self.config = config
+            def get_training_callbacks(self, attributes):
+                return ["theirs"]
             def get_outputs(self, camera):
                 named = {"viewmats": camera[5], "Ks": camera[6], "width": 9, "height": 9}
                 return rasterization(*camera[:5], **named, rasterize_mode=self.config.rasterize_mode)
@@ -151,21 +154,42 @@ def test_its_images_are_ours_and_those_of_splatfacto_are_not(run):
     """)
 
 
+def test_a_training_begins_with_the_cheaper_footprint(run):
+    """Until nine tenths of its steps. Evaluation, and a model that nobody trains, have the other one."""
+    run("""
+    from types import SimpleNamespace
+    from nerfstudio.configs.method_configs import all_methods
+    from analytic_rasterizer.dialects.gsplat import rasterization
+    config = dataclasses.replace(all_methods["splatfacto-analytic"].pipeline.model, footprint="point:dilation=0")
+    cheap, dear = (rasterization(*camera, 9, 9, footprint=f)[0] for f in ("box:samples=1", "point:dilation=0"))
+    assert not torch.equal(cheap, dear)
+    model = config._target(config)
+    assert torch.equal(model.get_outputs(camera)[0], dear)
+    trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=20))
+    assert model.get_training_callbacks(SimpleNamespace(trainer=trainer)) == ["theirs"]
+    for model.step, expected in ((0, cheap), (17, cheap), (18, dear), (19, dear)):
+        assert torch.equal(model.get_outputs(camera)[0], expected), model.step
+    model.step, model.training = 0, False
+    assert torch.equal(model.get_outputs(camera)[0], dear)
+    """)
+
+
 def test_errors_come_before_a_model(run):
     printed = run("""
     from nerfstudio.configs.method_configs import all_methods
     config = all_methods["splatfacto-analytic"].pipeline.model
-    for options in ({"footprint": "disc"}, {"rasterize_mode": "antialiased"}):
+    for options in ({"footprint": "disc"}, {"rasterize_mode": "antialiased"}, {"footprint_from": 1.5}):
         try:
             dataclasses.replace(config, **options)
         except ValueError as error:
             print(error)
     """)
-    first, second = printed.splitlines()
+    first, second, third = printed.splitlines()
     assert "disc" in first and all(name in first for name in ar.FOOTPRINTS)
     assert second == (
         "rasterize_mode must be 'classic' with splatfacto-analytic, whose option is footprint, got 'antialiased'"
     )
+    assert third == "footprint_from must be 0 to 1, got 1.5"
 
 
 def test_a_splatfacto_that_calls_something_else_is_refused(run):

@@ -1,6 +1,7 @@
 """`--effects`: what a training takes of what its capture calls for, by itself."""
 
 import json
+import math
 import shutil
 import warnings
 
@@ -39,6 +40,10 @@ def described(out) -> dict:
     return json.loads((out / files.OPTIONS).read_text())
 
 
+DEFAULT = {"footprint": TrainingOptions.footprint}
+BEGINNING = {"first_footprint": "box:samples=1", "footprint_from": 0.9}  # of photographs of one size
+
+
 def settle(folder, options=None, given=None, chosen=(), ranks=None):
     source = CaptureSource(folder, **(given or {}))
     return automatic.settle(source, options or TrainingOptions(), chosen, ranks or Ranks())
@@ -48,8 +53,8 @@ def test_an_uneven_capture_is_trained_with_corrections(uneven, tmp_path, capsys)
     """By itself, and test and resumption know it."""
     assert train(uneven, tmp_path) == 0
     shown = capsys.readouterr()
-    first = plan.plan_capture(uneven).to_lines()
-    assert shown.err.splitlines()[: len(first) + 1] == [*first, "--effects auto takes --exposure affine"]
+    first = [*plan.plan_capture(uneven).to_lines(), "--effects auto takes --exposure affine"]
+    assert shown.err.splitlines()[: len(first)] == first
     assert "after the best affine colour" in shown.out
     found = described(tmp_path)
     assert (found["options"]["exposure"], found["options"]["effects"]) == ("affine", "auto")
@@ -89,13 +94,14 @@ def test_a_switch_wins(uneven, tmp_path, capsys):
     assert described(tmp_path / "out")["options"]["exposure"] == "none"
     settled = settle(uneven, TrainingOptions(exposure="affine"))
     assert (settled.taken, settled.options.exposure) == ({}, "affine")
-    assert settled.lines[-1] == "--effects auto takes nothing"
+    assert settled.lines[-2] == "--effects auto takes nothing"
 
 
 def test_a_capture_without_evidence_trains_to_the_same_bits(even, tmp_path):
     scenes = []
     for effects in ("auto", "none"):
-        run = training.Run(even, tmp_path / effects, TrainingOptions(**TINY, effects=effects, iterations=20))
+        options = TrainingOptions(**TINY, effects=effects, iterations=20, first_footprint="none")
+        run = training.Run(even, tmp_path / effects, options)
         run.train()
         scenes.append(io.load_scene(tmp_path / effects / files.SCENE))
         assert described(tmp_path / effects)["source"]["taken"] == {}
@@ -107,9 +113,48 @@ def test_scales_that_photographs_call_for(tmp_path):
     views = cameras(lambda i: 4.0 if i % 2 else 19.0)
     settled = settle(write_wall(tmp_path, views))
     assert settled.taken == {"scales": (1, 2, 4, 8)} and settled.source.lens is None
-    assert settled.options == TrainingOptions(scales=(1, 2, 4, 8))
+    assert settled.options == TrainingOptions(scales=(1, 2, 4, 8), **BEGINNING | {"footprint_from": 0.5})
     assert settle(tmp_path, TrainingOptions(scales=(1, 2))).taken == {}
-    assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions()
+    assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions(**BEGINNING)
+
+
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        ({}, ("box:samples=1", 0.9)),
+        ({"scales": (1, 2)}, ("box:samples=1", 0.5)),
+        ({"footprint": "analytic"}, ("box:samples=1", 0.9)),
+        ({"footprint": "box:samples=16"}, ("box:samples=1", 0.9)),
+        ({"footprint": "box:samples=1"}, (None, 0.9)),
+        ({"footprint": "mip"}, (None, 0.9)),  # another picture, and as quick
+        ({"footprint_from": 0.3}, ("box:samples=1", 0.3)),
+        ({"first_footprint": "point"}, ("point:dilation=0.3", 0.9)),
+        ({"first_footprint": "none"}, (None, 0.9)),
+        ({"effects": "none"}, (None, 0.9)),
+    ],
+    ids=str,
+)
+def test_what_a_training_begins_with(even, tmp_path, given, expected, capsys):
+    run = training.Run(even, tmp_path, TrainingOptions(**TINY | DEFAULT | {"iterations": 20} | given))
+    assert (run.options.begins_with, run.options.footprint_from) == expected
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("begins with ")]
+    if expected[0] and "first_footprint" not in given:
+        footprint, share = run.options.footprint, f"{expected[1]:.0%}"
+        told = f"begins with {expected[0]}, and goes on with {footprint} when {share} is over"
+        assert said == [f"{told} (--first-footprint none: does not)"]
+    else:
+        assert said == []
+    until = math.ceil(20 * expected[1]) if expected[0] else 0
+    seen = []
+    for _ in range(20):
+        seen.append(run.trainer.footprint)
+        run.trainer.step()
+    assert seen == [expected[0]] * until + [run.options.footprint] * (20 - until)
+
+
+def test_photographs_with_alpha_begin_with_it_for_a_shorter_time(tmp_path):
+    write_nerf_synthetic(tmp_path, circle(6), circle(2))
+    assert settle(tmp_path).options == TrainingOptions(**BEGINNING | {"footprint_from": 0.5})
 
 
 def test_missing_pictures_and_cameras_far_away(tmp_path, capsys):
@@ -174,10 +219,10 @@ def test_several_processes_take_what_the_first_finds(uneven, monkeypatch):
     first = settle(uneven, ranks=_Several(0, 2))
     monkeypatch.setattr(automatic, "plan_capture", None)
     second = settle(uneven, ranks=_Several(1, 2))
-    assert first.options == second.options == TrainingOptions() and first.taken == second.taken == {}
+    assert first.options == second.options == TrainingOptions(**BEGINNING) and first.taken == second.taken == {}
     assert second.lines == []
     expected = "--effects auto takes nothing, and not --exposure affine, which 2 processes cannot learn: train on one"
-    assert first.lines[-1] == expected
+    assert first.lines[-2] == expected
 
 
 def test_a_capture_without_points_takes_nothing(tmp_path):

@@ -19,6 +19,8 @@ from nerfstudio.models import splatfacto
 from ...footprints import RECOMMENDED, resolve_footprint
 from .patching import rasterization_of_installed
 
+CHEAP = "box:samples=1"  # while shapes are being found, one sample in a pixel does as well as many
+
 NAME = "splatfacto-analytic"
 
 _FOOTPRINT: ContextVar[str | None] = ContextVar("_FOOTPRINT", default=None)
@@ -32,16 +34,23 @@ class SplatfactoAnalyticModelConfig(splatfacto.SplatfactoModelConfig):
     Attributes:
         footprint: Weight of a Gaussian in a pixel: a footprint of analytic_rasterizer, with its options. It replaces
             rasterize_mode, which must be left as it is.
+        first_footprint: Cheaper one, for the steps before; `footprint` from the start where it is the same.
+        footprint_from: Share of the training from which on `footprint` is used, 0 to 1.
 
     Raises:
-        ValueError: No such footprint, or a `rasterize_mode` that would not be read.
+        ValueError: No such footprint, a share outside its range, or a `rasterize_mode` that would not be read.
     """
 
     _target: type = dataclasses.field(default_factory=lambda: SplatfactoAnalyticModel)
     footprint: str = RECOMMENDED
+    first_footprint: str = CHEAP
+    footprint_from: float = 0.9
 
     def __post_init__(self) -> None:
-        resolve_footprint(self.footprint)
+        for footprint in (self.footprint, self.first_footprint):
+            resolve_footprint(footprint)
+        if not 0 <= self.footprint_from <= 1:
+            raise ValueError(f"footprint_from must be 0 to 1, got {self.footprint_from}")
         default = splatfacto.SplatfactoModelConfig.rasterize_mode
         if self.rasterize_mode != default:
             raise ValueError(
@@ -58,14 +67,22 @@ class SplatfactoAnalyticModel(splatfacto.SplatfactoModel):
     """
 
     config: SplatfactoAnalyticModelConfig
+    _dear_from: float = 0.0  # step from which on pictures of a training have the footprint of the end
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         _redirect()
         super().__init__(*args, **kwargs)
 
+    def get_training_callbacks(self, training_callback_attributes: Any) -> Any:
+        """As splatfacto's. Learns how long the training is."""
+        trainer = training_callback_attributes.trainer
+        self._dear_from = self.config.footprint_from * (0 if trainer is None else trainer.config.max_num_iterations)
+        return super().get_training_callbacks(training_callback_attributes)
+
     def get_outputs(self, camera: Any) -> Any:
         """As splatfacto's. `camera` is one of nerfstudio's."""
-        token = _FOOTPRINT.set(self.config.footprint)
+        cheap = self._dear_from > 0 and self.training and self.step < self._dear_from
+        token = _FOOTPRINT.set(self.config.first_footprint if cheap else self.config.footprint)
         try:
             return super().get_outputs(camera)
         finally:
