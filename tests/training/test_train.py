@@ -349,11 +349,12 @@ def cpu_test_pictures(folder):
         {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "scale_repeats": (2, 1)},
         {"density": "mcmc", "background": "random", "pictures_per_step": 2},
         {"density": "3dgs", "sh_degree": 0},
+        {"footprint_from": 0.8},
         {"sh_degree": 0, "density": "mcmc"},
         {"sparse_adam": True},
         {"sparse_adam": True, "density": "mcmc", "pictures_per_step": 2},
     ],
-    ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "mcmc-constant-colors", "sparse", "sparse-mcmc"],
+    ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "cheap", "mcmc-constant-colors", "sparse", "sparse-mcmc"],
 )
 def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, options):
     """Through a file, at a step between two changes of density, and against a run without a break."""
