@@ -41,6 +41,7 @@ PRESETS = {
             "densify_until": 0.5,
             "split_above": 0.01,
             "max_gaussians": 0,
+            "pixels_per_gaussian": 0.0,
             "means_rate": 1.6e-4,
             "color_rate": 2.5e-3,
             "scale_rate": 5e-3,
@@ -208,6 +209,7 @@ class TrainingOptions:
     split_above: float = GradientGrowth.split_above
     prune_above: float = GradientGrowth.prune_above
     max_gaussians: int = StartOptions.max_gaussians
+    pixels_per_gaussian: float = StartOptions.pixels_per_gaussian
     grow_share: float = MonteCarloOptions.grow_share
     noise: float = MonteCarloOptions.noise
     opacity_weight: float = LossOptions.opacity_weight

@@ -222,6 +222,15 @@ class StartOptions(Options):
         main=True,
     )
 
+    pixels_per_gaussian: float = option(
+        16.0,
+        "Pixels of all training pictures, at the finest scale, for each Gaussian: a lower limit than the default of "
+        "`max_gaussians` where pictures are few or small. It leaves the Gaussians of the start, and holds only where "
+        "`max_gaussians` has its default. 0: no such limit.",
+        NOT_NEGATIVE,
+        metavar="PIXELS",
+    )
+
     def __post_init__(self):
         super().__post_init__()
         # More than the limit is refused where the points are made: options of finished trainings can still be read.

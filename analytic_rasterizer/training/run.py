@@ -46,7 +46,7 @@ from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
 from .source import CaptureSource
-from .start import background_of, first_gaussians, of_length
+from .start import background_of, begin, of_length
 from .store import PictureMemory, described, processes_here
 from .trainer import Trainer
 
@@ -159,12 +159,13 @@ class Run:
         self.options = found.options
         with said_first(found.lines):
             self._load_capture(found.source.settled(), found.taken)
-            self.notes = [*found.notes, *self.capture.notes]
             found.source.check_effect(self.capture, chosen)  # raises before the pictures are read
-            start, self.points_found = first_gaussians(self.options, self.capture, source.points, chosen)
+            start, self.points_found, self.options, said = begin(self.options, self.capture, source.points, chosen)
+            self.notes = [*found.notes, *self.capture.notes, *said]
             if source.points is None and self.capture.points is None and self.capture.starts_in_view:
-                random = f"{start.count:,} random ones in the views (--points)"
-                self.notes.append(f"no points in the capture: starts from {random}")
+                self.notes.append(
+                    f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
+                )
         return start, found.stops
 
     def _continue(self, source: CaptureSource, state: dict[str, Any]) -> Gaussians:

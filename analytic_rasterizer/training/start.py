@@ -5,7 +5,7 @@ Also the options of a checkpoint that goes on to another length.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
@@ -17,9 +17,11 @@ from .captures import Capture
 from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
-from .parts import BACKGROUNDS, RANDOM_BACKGROUND
+from .parts import BACKGROUNDS, RANDOM_BACKGROUND, RANDOM_POINTS
 from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
+
+FEWEST = 1000  # Gaussians that any training may have
 
 
 def of_length(
@@ -48,6 +50,41 @@ def of_length(
             raise ValueError(f"seconds must be at least {elapsed:.1f}, those that are over, got {seconds}")
         return replace(stored, seconds=seconds)
     return stored
+
+
+def pixel_limit(options: TrainingOptions, views: Sequence[io.View], chosen: Collection[str] = ()) -> int | None:
+    """As many Gaussians as pictures of these views can show, by `pixels_per_gaussian`.
+
+    None where another limit was chosen, or this one is no lower.
+    """
+    usual = options.max_gaussians == TrainingOptions.max_gaussians and "max_gaussians" not in chosen
+    if not usual or options.pixels_per_gaussian == 0 or options.density == "none":
+        return None
+    finest = min(options.scales)
+    pixels = sum((view.width // finest) * (view.height // finest) for view in views)
+    limit = max(round(pixels / options.pixels_per_gaussian), FEWEST)
+    return limit if limit < options.max_gaussians else None
+
+
+def begin(
+    options: TrainingOptions, capture: Capture, points, chosen: Collection[str] = ()
+) -> tuple[Gaussians, int | None, TrainingOptions, list[str]]:
+    """As `first_gaussians`; and the options, with a limit of Gaussians by what the pictures can show, and what to say.
+
+    The limit takes no Gaussian of the start away, but for random ones, whose number nobody chose.
+    """
+    limit = pixel_limit(options, [item.view for item in capture.train], chosen)
+    if limit is not None and options.random_points == RANDOM_POINTS and "random_points" not in chosen:
+        options = replace(options, random_points=min(RANDOM_POINTS, limit))
+    start, found = first_gaussians(options, capture, points, chosen)
+    if limit is None:
+        return start, found, options, []
+    options = replace(options, max_gaussians=max(limit, start.count))
+    told = (
+        f"at most {options.max_gaussians:,} Gaussians, as many as {len(capture.train)} pictures of this size can show "
+        "(--pixels-per-gaussian, --max-gaussians)"
+    )
+    return start, found, options, [told]
 
 
 def first_gaussians(

@@ -38,6 +38,8 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
         note(["random_points"], f"the training starts from {start}")
     if start == "a scene":
         note(["initial_opacity", "initial_scale"], "the training starts from a scene")
+    if options.max_gaussians != TrainingOptions.max_gaussians:
+        note(["pixels_per_gaussian"], f"max_gaussians is {options.max_gaussians:,}, which holds in its place")
     if options.densify_until == 0:
         note(growth_of(options) - {"densify_until"}, "densify_until is 0, so that nothing changes")
     if len(options.scales) == 1:
