@@ -162,10 +162,6 @@ class Run:
             found.source.check_effect(self.capture, chosen)  # raises before the pictures are read
             start, self.points_found, self.options, said = begin(self.options, self.capture, source.points, chosen)
             self.notes = [*found.notes, *self.capture.notes, *said]
-            if source.points is None and self.capture.points is None and self.capture.starts_in_view:
-                self.notes.append(
-                    f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
-                )
         return start, found.stops
 
     def _continue(self, source: CaptureSource, state: dict[str, Any]) -> Gaussians:

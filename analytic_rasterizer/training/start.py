@@ -77,14 +77,14 @@ def begin(
     if limit is not None and options.random_points == RANDOM_POINTS and "random_points" not in chosen:
         options = replace(options, random_points=min(RANDOM_POINTS, limit))
     start, found = first_gaussians(options, capture, points, chosen)
-    if limit is None:
-        return start, found, options, []
-    options = replace(options, max_gaussians=max(limit, start.count))
-    told = (
-        f"at most {options.max_gaussians:,} Gaussians, as many as {len(capture.train)} pictures of this size can show "
-        "(--pixels-per-gaussian, --max-gaussians)"
-    )
-    return start, found, options, [told]
+    said = []
+    if limit is not None:
+        options = replace(options, max_gaussians=max(limit, start.count))
+        shown = f"as many as {len(capture.train)} pictures of this size can show"
+        said.append(f"at most {options.max_gaussians:,} Gaussians, {shown} (--pixels-per-gaussian, --max-gaussians)")
+    if points is None and capture.points is None and capture.starts_in_view:
+        said.append(f"no points in the capture: starts from {start.count:,} random ones in the views (--points)")
+    return start, found, options, said
 
 
 def first_gaussians(
