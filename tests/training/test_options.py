@@ -17,6 +17,8 @@ NAMES = [each.name for each in fields(TrainingOptions)]
 # Values of all options that are not the defaults.
 OTHERS = {
     "footprint": "box:samples=1",
+    "first_footprint": "box:samples=1",
+    "footprint_from": 0.5,
     "scales": (2, 4),
     "scale_repeats": (3, 1),
     "downsampling": "bicubic",
@@ -73,7 +75,7 @@ def test_an_option_is_kept_in_its_part(name):
 
 def test_files_have_all_options_in_the_same_order():
     """Those of another density control too, with their defaults: other versions read them."""
-    assert NAMES[0] == "footprint" and NAMES[-1] == "scale_weight" and len(NAMES) == 45
+    assert NAMES[0] == "footprint" and NAMES[-1] == "scale_weight" and len(NAMES) == 48
     for density in DENSITIES:
         assert list(TrainingOptions(density=density).to_dict()) == NAMES
 

@@ -961,8 +961,9 @@ def test_evaluate_compares_footprints(trained, capsys):
     assert cli.main([*arguments, "--lpips", "none", "--pictures", "1"]) == 0
     table = capsys.readouterr().out.splitlines()
     assert table[0].split() == ["footprint", "1/1", "1/2", "1/4", "mean"]
-    names = [line.split()[:2] for line in table[1:] if line.split()[0] in ("box:samples=4", "point:dilation=0.3")]
-    assert names == [[name, m] for name in ("box:samples=4", "point:dilation=0.3") for m in ("PSNR", "SSIM")]
+    footprints, measures = ("box:samples=4", "point:dilation=0.3"), ("PSNR", "SSIM", "PSNR,")
+    names = [line.split()[:2] for line in table[1:] if line.split()[0] in footprints]
+    assert names == [[name, measure] for name in footprints for measure in measures]
     results = json.loads((trained / "evaluation.json").read_text())["results"]
     metrics = json.loads((trained / files.METRICS).read_text())["test"]
     for scale in ("1", "2"):  # the .ply rounds a little
@@ -993,7 +994,8 @@ def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
     of_evaluation = json.loads(evaluation, parse_constant=refuse_constant)["results"]["moment:samples=4"]
     for measured in (metrics["test"], of_evaluation):
         views = measured["1"]["views"]
-        assert views[0] == {"psnr": None, "ssim": pytest.approx(1)} and 0 < views[1]["psnr"] < 99
+        assert views[0] == {"psnr": None, "ssim": pytest.approx(1), "psnr_color_corrected": None}
+        assert 0 < views[1]["psnr"] < 99
         assert measured["1"]["psnr"] is None and measured["mean"]["psnr"] is None
     files.write_log(tmp_path / files.LOG, [{"step": 10, "psnr": math.inf}, {"step": 20, "psnr": 30.5}])
     assert (tmp_path / files.LOG).read_text() == '{"step": 10, "psnr": null}\n{"step": 20, "psnr": 30.5}\n'
