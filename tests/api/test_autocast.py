@@ -5,6 +5,7 @@ import pytest
 import torch
 from marks import needs_newer_compiler
 from originals import CAMERA, COUNT, ORIGINALS, arguments_of, fields_of, scene_of
+from scenes import to, without
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import dialects, distributed
@@ -39,16 +40,10 @@ def rasterizer(given):
 def effects(given):
     """What Python computes with inputs itself: the filter, the lens, the depths."""
     width, aperture = given.pop("width"), given.pop("aperture")
-    some = ar.Effects(
-        depth=True, median_depth=True, gaussian_stats=True, filter_3d=width, camera_gradients=True, off_center=True,
-        defocus=ar.Defocus(aperture, 3.0),
-    )  # fmt: skip
+    flags = dict.fromkeys(("depth", "median_depth", "gaussian_stats", "camera_gradients", "off_center"), True)
+    some = ar.Effects(**flags, filter_3d=width, defocus=ar.Defocus(aperture, 3.0))
     color, radii, outputs = ar.GaussianRasterizer(settings_with(given, effects=some))(**given)
     return color, radii, outputs.depth, outputs.median_depth, *outputs.gaussian_stats
-
-
-def image_behind(given):
-    return ar.GaussianRasterizer(settings_with(given))(**given)
 
 
 def function(given):
@@ -60,15 +55,14 @@ def function(given):
 def stages(given):
     features, behind = given.pop("features"), given.pop("behind")
     settings = settings_with(given, footprint="box:samples=16")
-    splats = ar.project(settings, **{k: v for k, v in given.items() if k != "means2D"})
+    splats = ar.project(settings, **without(given, "means2D"))
     lists = ar.list_tiles(splats)
     features = features[splats.gaussian_ids.long()]
     return (*ar.blend(splats, lists, features, behind), splats.means2d, splats.cov2d)
 
 
 def timed_stages(given):
-    settings = settings_with(given)
-    return ar.render_stages(settings, **{k: v for k, v in given.items() if k != "means2D"})[:5]
+    return ar.render_stages(settings_with(given), **without(given, "means2D"))[:5]
 
 
 def gsplat(given):
@@ -80,22 +74,18 @@ def gsplat(given):
 
 
 def cameras_of_gsplat(device):
-    intrinsics = torch.tensor([[33.0, 0.0, 20.0], [0.0, 31.0, 15.0], [0.0, 0.0, 1.0]], device=device)
-    return {
-        "viewmats": CAMERA.world_to_camera().to(device, torch.float32)[None],
-        "Ks": intrinsics[None],
-        "backgrounds": torch.tensor([[0.2, 0.4, 0.6]], device=device),
-    }
+    intrinsics = torch.tensor([[[33.0, 0.0, 20.0], [0.0, 31.0, 15.0], [0.0, 0.0, 1.0]]], device=device)
+    view, behind = CAMERA.world_to_camera().to(device, torch.float32)[None], torch.tensor([[0.2, 0.4, 0.6]])
+    return {"viewmats": view, "Ks": intrinsics, "backgrounds": behind.to(device)}
 
 
 def of_one_rank(given):
-    settings = settings_with(given)
-    batch = distributed.rasterize([settings], **{k: v for k, v in given.items() if k != "means2D"})
+    batch = distributed.rasterize([settings_with(given)], **without(given, "means2D"))
     return batch.renderings[0].image, batch.renderings[0].alpha
 
 
 def bands(given):
-    band = distributed.rasterize_bands(settings_with(given), **{k: v for k, v in given.items() if k != "means2D"})
+    band = distributed.rasterize_bands(settings_with(given), **without(given, "means2D"))
     return band.image, band.alpha
 
 
@@ -111,25 +101,29 @@ def parameters(device):
 
 
 def splats(device):
-    return {
-        "offset": torch.tensor([[0.3, -0.2], [0.1, 0.7]], device=device),
-        "cov2d": torch.tensor([[0.7, 0.1, 0.9]], device=device),
-    }
+    given = {"offset": [[0.3, -0.2], [0.1, 0.7]], "cov2d": [[0.7, 0.1, 0.9]]}
+    return {name: torch.tensor(values, device=device) for name, values in given.items()}
+
+
+def with_blur(device):
+    return to(with_camera(device) | {"width": torch.full((COUNT,), 0.01), "aperture": torch.tensor(0.1)}, device)
+
+
+def with_features(device):
+    return to(with_camera(device) | {"features": torch.rand(COUNT, 3), "behind": torch.rand(3)}, device)
+
+
+def filtered(given):
+    return ar.apply_3d_filter(given["scales"], given["opacities"], given["width"])
 
 
 # A call of a dictionary of inputs, and the inputs by device.
 CALLS = {
     "rasterizer": (rasterizer, with_camera),
-    "effects": (
-        effects,
-        lambda d: with_camera(d) | {"width": torch.full((COUNT,), 0.01, device=d), "aperture": torch.tensor(0.1).to(d)},
-    ),
-    "image behind": (image_behind, lambda d: scene(d) | {"bg": torch.rand(3, *SIZE, device=d)}),
+    "effects": (effects, with_blur),
+    "image behind": (rasterizer, lambda d: scene(d) | {"bg": torch.rand(3, *SIZE, device=d)}),
     "function": (function, with_camera),
-    "stages": (
-        stages,
-        lambda d: with_camera(d) | {"features": torch.rand(COUNT, 3, device=d), "behind": torch.rand(3, device=d)},
-    ),
+    "stages": (stages, with_features),
     "timed stages": (timed_stages, with_camera),
     "gsplat": (gsplat, lambda d: scene(d) | cameras_of_gsplat(d)),
     "one rank": (of_one_rank, with_camera),
@@ -138,10 +132,7 @@ CALLS = {
     "ssim": (lambda given: (ar.losses.ssim(given["image"], given["target"].detach(), "none"),), pictures),
     "activations": (lambda given: ar.activations.activate(**given), parameters),
     "weight": (lambda given: (ar.footprint_weight(**given),), splats),
-    "filter": (
-        lambda given: ar.apply_3d_filter(given["scales"], given["opacities"], given["width"]),
-        lambda d: scene_of(d) | {"width": torch.rand(COUNT, device=d) / 9},
-    ),
+    "filter": (filtered, lambda d: scene_of(d) | {"width": torch.rand(COUNT, device=d) / 9}),
     "visible": (lambda given: [ar.GaussianRasterizer(settings_with(given)).markVisible(given["means3D"])], with_camera),
 }
 

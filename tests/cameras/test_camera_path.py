@@ -36,14 +36,13 @@ def ring(count, elevation=0.4, distance=4.0, **options):
     second = torch.linalg.cross(up, first)
     angles = [0.3 + 5 * (i / count) ** 2 for i in range(count)]
     level = [math.cos(a) * first + math.sin(a) * second for a in angles]
-    return [
-        view_from(CENTER + distance * (math.cos(elevation) * v + math.sin(elevation) * up), **options) for v in level
-    ]
+    rays = [math.cos(elevation) * v + math.sin(elevation) * up for v in level]
+    return [view_from(CENTER + distance * ray, **options) for ray in rays]
 
 
-def random_rotation(seed):
-    q = torch.randn(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return rotation_matrices(q)
+def side_by_side(count):
+    """Views on a line that all look the same way."""
+    return [view_from(vector(x, 0, 0), target=vector(x, 0, 1), up=vector(0, -1, 0)) for x in range(count)]
 
 
 def test_a_camera_looks_at_its_target_and_is_level():
@@ -106,8 +105,7 @@ def test_a_path_passes_through_its_views():
 
 
 def test_a_path_of_views_on_a_line_is_the_line():
-    views = [view_from(vector(x, 0, 0), target=vector(x, 0, 1), up=vector(0, -1, 0)) for x in (0, 1, 2, 3)]
-    frames = through(views, 31)
+    frames = through(side_by_side(4), 31)
     assert torch.allclose(torch.stack([position(frame) for frame in frames])[:, 0], torch.linspace(0, 3, 31).double())
 
 
@@ -135,7 +133,7 @@ def test_a_path_needs_two_views():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_quaternion_of_a_rotation(seed):
-    rotation = random_rotation(seed)
+    rotation = rotation_matrices(torch.randn(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
     assert torch.allclose(rotation_matrices(quaternion(rotation)), rotation, atol=1e-12)
     half_turn = rotation @ torch.diag(vector(1, -1, -1)) @ rotation.T
     assert torch.allclose(rotation_matrices(quaternion(half_turn)), half_turn, atol=1e-12)
@@ -143,9 +141,8 @@ def test_quaternion_of_a_rotation(seed):
 
 def test_views_of_an_object_converge_on_it():
     assert torch.allclose(focus(ring(6)), CENTER, atol=1e-9)
-    same_way = [view_from(vector(x, 0, 0), target=vector(x, 0, 1), up=vector(0, -1, 0)) for x in (0, 1, 2)]
     outwards = [view_from(2 * position(view) - CENTER, target=3 * position(view) - 2 * CENTER) for view in ring(6)]
-    assert focus(same_way) is None and focus(outwards) is None and focus(ring(1)) is None
+    assert focus(side_by_side(3)) is None and focus(outwards) is None and focus(ring(1)) is None
 
 
 @pytest.mark.parametrize("count", [2, 3, 8])
@@ -155,8 +152,7 @@ def test_up_is_across_the_horizons_of_level_cameras(count):
 
 
 def test_up_of_views_without_a_horizon_is_that_of_their_pictures():
-    same_way = [view_from(vector(x, 0, 0), target=vector(x, 0, 1), up=vector(0, -1, 0)) for x in (0, 1, 2)]
-    assert torch.allclose(level_up(same_way), vector(0, -1, 0))
+    assert torch.allclose(level_up(side_by_side(3)), vector(0, -1, 0))
     rolled = []
     for i, view in enumerate(ring(9)):
         w2c = view.w2c.clone()

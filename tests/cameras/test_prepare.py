@@ -93,7 +93,10 @@ def arguments_of(model, off_center, dtype=torch.float64, device="cpu"):
     return (views, intrinsics, coefficients), (WIDTH, HEIGHT, model, NEAR, FAR, off_center)
 
 
-@pytest.mark.parametrize(("model", "off_center"), CASES)
+each_case = pytest.mark.parametrize(("model", "off_center"), CASES)
+
+
+@each_case
 def test_cameras_are_those_of_torch(model, off_center, device):
     tensors, numbers = arguments_of(model, off_center, device=device)
     made = OPS.prepare_cameras(*tensors, *numbers)
@@ -115,7 +118,7 @@ def test_cameras_are_those_of_torch(model, off_center, device):
         assert math.isclose(row[columns("reach")].item(), measure(reach), rel_tol=1e-9)
 
 
-@pytest.mark.parametrize(("model", "off_center"), CASES)
+@each_case
 def test_float32_is_float64_rounded_once(model, off_center, device):
     tensors, numbers = arguments_of(model, off_center, torch.float32, device)
     made = OPS.prepare_cameras(*tensors, *numbers)
@@ -125,7 +128,7 @@ def test_float32_is_float64_rounded_once(model, off_center, device):
         assert torch.equal(result, wanted.float())
 
 
-@pytest.mark.parametrize(("model", "off_center"), CASES)
+@each_case
 def test_gradients_of_cameras(model, off_center):
     tensors, numbers = arguments_of(model, off_center)
     leaves = [t.clone().requires_grad_() for t in tensors if t is not None]
@@ -137,17 +140,13 @@ def test_gradients_of_cameras(model, off_center):
     assert torch.autograd.gradcheck(differentiable, leaves)
 
 
-@pytest.mark.parametrize(("model", "off_center"), CASES)
+@each_case
 def test_gradients_of_cameras_are_those_of_torch(model, off_center, device):
     tensors, numbers = arguments_of(model, off_center, torch.float32, device)
     gradients = []
     for double in (False, True):
-        leaves = [
-            t.detach().to("cpu" if double else device, torch.float64 if double else t.dtype)
-            for t in tensors
-            if t is not None
-        ]
-        leaves = [t.requires_grad_() for t in leaves]
+        place = ("cpu", torch.float64) if double else (device, torch.float32)
+        leaves = [t.detach().to(*place).requires_grad_() for t in tensors if t is not None]
         given = (*leaves, *(None,) * (3 - len(leaves)))
         made = prepared_in_torch(*given, model, off_center) if double else OPS.prepare_cameras(*given, *numbers)
         g = torch.Generator().manual_seed(1)
@@ -203,11 +202,8 @@ def lens_arguments(model="fisheye", dtype=torch.float64, device="cpu"):
     given["distortion"] = lens[0, columns("distortion")].clone()
     values = lens[0].tolist()
     values[columns("reach")] = values[columns("fold")] = [0.0]
-    return {"viewmatrix": view[0].clone(), "projmatrix": proj[:1].clone(), **given}, {
-        "numbers": values,
-        "centered": True,
-        "height": HEIGHT,
-    }
+    matrices = {"viewmatrix": view[0].clone(), "projmatrix": proj[:1].clone()}
+    return matrices | given, {"numbers": values, "centered": True, "height": HEIGHT}
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -215,9 +211,8 @@ def test_the_lens_of_matrices_is_that_of_the_camera(model, device):
     tensors, numbers = lens_arguments(model, device=device)
     numbers["numbers"][columns("center")] = [0.0, 0.0]
     coefficients, without = tensors["distortion"], dict.fromkeys(GIVEN)
-    expected = OPS.prepare_cameras(
-        *(t[:1] for t in cameras(device=device)), coefficients[None], WIDTH, HEIGHT, model, NEAR, FAR
-    )[3][0]
+    one = (t[:1] for t in cameras(device=device))
+    expected = OPS.prepare_cameras(*one, coefficients[None], WIDTH, HEIGHT, model, NEAR, FAR)[3][0]
     for given in (without, without | {"distortion": coefficients}):
         lens = OPS.prepare_lens(**tensors | given, **numbers)
         assert torch.allclose(lens, expected, rtol=1e-12, atol=1e-12)

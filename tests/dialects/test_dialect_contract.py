@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from originals import BASE
 
 import diff_gaussian_rasterization as module
 from diff_gaussian_rasterization import GaussianRasterizationSettings as Settings
@@ -27,27 +28,11 @@ class Program:
         view[3, 2] = 4
         lens = torch.tensor([[2.4, 0, 0, 0], [0, 2.4, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])
         self.view, self.lens = view.to(device), lens.to(device)
-        self.camera = {
-            "image_height": 32,
-            "image_width": 48,
-            "tanfovx": 0.4,
-            "tanfovy": 0.4,
-            "bg": torch.tensor([0.1, 0.2, 0.3], device=device),
-            "scale_modifier": 1.0,
-            "viewmatrix": self.view,
-            "projmatrix": self.view @ self.lens,
-            "sh_degree": 1,
-            "campos": torch.tensor([0.0, 0, -4], device=device),
-            "prefiltered": False,
-            "debug": False,
-        }
-        self.scene = {
-            "means3D": randn(COUNT, 3),
-            "opacities": rand(COUNT, 1),
-            "shs": 0.1 * randn(COUNT, 4, 3),
-            "scales": 0.1 * rand(COUNT, 3),
-            "rotations": randn(COUNT, 4),
-        }
+        bg, campos = torch.tensor([0.1, 0.2, 0.3], device=device), torch.tensor([0.0, 0, -4], device=device)
+        values = 32, 48, 0.4, 0.4, bg, 1.0, self.view, self.view @ self.lens, 1, campos, False, False
+        self.camera = dict(zip(BASE, values, strict=True))
+        self.scene = {"means3D": randn(COUNT, 3), "opacities": rand(COUNT, 1), "shs": 0.1 * randn(COUNT, 4, 3)}
+        self.scene |= {"scales": 0.1 * rand(COUNT, 3), "rotations": randn(COUNT, 4)}
         self.picture = self.render()
         assert (self.picture[0] - self.camera["bg"][:, None, None]).abs().max() > 0.1
 

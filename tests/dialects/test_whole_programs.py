@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
+from originals import BASE
 
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in
@@ -76,20 +77,9 @@ class Camera:
         self.depths: torch.Tensor | None = None
 
     def fields(self, sh_degree):
-        return {
-            "image_height": SIDE,
-            "image_width": SIDE,
-            "tanfovx": self.tangent,
-            "tanfovy": self.tangent,
-            "bg": torch.zeros(3),
-            "scale_modifier": 1.0,
-            "viewmatrix": self.view,
-            "projmatrix": self.full,
-            "sh_degree": sh_degree,
-            "campos": self.center,
-            "prefiltered": False,
-            "debug": False,
-        }
+        size, tangents = (SIDE, SIDE), (self.tangent, self.tangent)
+        values = *size, *tangents, torch.zeros(3), 1.0, self.view, self.full, sh_degree, self.center, False, False
+        return dict(zip(BASE, values, strict=True))
 
 
 def photographs(cameras, exposures=None):
@@ -120,16 +110,10 @@ class Program:
         near = torch.cdist(points, points).topk(4, largest=False).values[:, 1:].square().mean(1)
         harmonics = torch.zeros(START, 3, 16)
         harmonics[:, :, 0] = (torch.rand(START, 3, generator=generator) - 0.5) / SH_C0
-        self.adopt(
-            {
-                "means": points,
-                "dc": harmonics[:, :, :1].transpose(1, 2).contiguous(),
-                "rest": harmonics[:, :, 1:].transpose(1, 2).contiguous(),
-                "opacities": torch.full((START, 1), 0.1).logit(),
-                "scales": near.sqrt().log()[:, None].repeat(1, 3),
-                "rotations": torch.eye(4)[:1].repeat(START, 1),
-            }
-        )
+        dc, rest = (part.transpose(1, 2).contiguous() for part in harmonics.split((1, 15), 2))
+        opacities, scales = torch.full((START, 1), 0.1).logit(), near.sqrt().log()[:, None].repeat(1, 3)
+        shapes = {"opacities": opacities, "scales": scales, "rotations": torch.eye(4)[:1].repeat(START, 1)}
+        self.adopt({"means": points, "dc": dc, "rest": rest} | shapes)
         self.exposures = torch.nn.Parameter(torch.eye(3, 4)[None].repeat(VIEWS, 1, 1))
         self.exposure_optimizer = torch.optim.Adam([self.exposures], lr=1e-2)
         self.watch_anew()
@@ -179,16 +163,10 @@ class Program:
         scales, opacities = self.widened()
         dc, rest = self.tensors["dc"], self.tensors["rest"]
         colors = {"dc": dc, "shs": rest} if self.repository.dialect == "accel" else {"shs": torch.cat([dc, rest], 1)}
-        picture, radii, *others = drop_in.GaussianRasterizer(raster_settings=settings)(
-            means3D=self.tensors["means"],
-            means2D=screen,
-            opacities=opacities,
-            scales=scales,
-            rotations=torch.nn.functional.normalize(self.tensors["rotations"]),
-            colors_precomp=None,
-            cov3D_precomp=None,
-            **colors,
-        )
+        arguments = {"means3D": self.tensors["means"], "means2D": screen, "opacities": opacities, "scales": scales}
+        arguments |= {"rotations": torch.nn.functional.normalize(self.tensors["rotations"])}
+        arguments |= colors | {"colors_precomp": None, "cov3D_precomp": None}
+        picture, radii, *others = drop_in.GaussianRasterizer(raster_settings=settings)(**arguments)
         return picture, radii, screen, others
 
     @torch.no_grad()

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from dataclasses import replace
 
 import pytest
 import reference
@@ -9,6 +10,8 @@ import scenes
 import torch
 from marks import each_kind, each_path
 from scenes import Camera
+from threads import same_on_threads
+from torch.nn.functional import pad
 
 import analytic_rasterizer as ar
 
@@ -16,21 +19,16 @@ CAMERA = Camera(image_height=29, image_width=37, sh_degree=1)
 ALL = ar.Effects(alpha=True, depth=True, inverse_depth=True)
 
 
-def render(scene, camera=CAMERA, dtype=torch.float64, device="cpu", **settings):
+def render(scene, settings, device):
     """What the rasterizer returns, on the device."""
-    rasterizer = ar.GaussianRasterizer(camera.settings(dtype, device, **settings))
-    return rasterizer(**scenes.to(scene, device))
+    return ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
 
 
 def colored(scene, channels, seed=0):
     """The scene with random colours of so many channels in place of harmonics."""
     g = torch.Generator().manual_seed(seed)
     colors = torch.rand(len(scene["means3D"]), channels, generator=g, dtype=scene["means3D"].dtype)
-    return {**{k: v for k, v in scene.items() if k != "shs"}, "colors_precomp": colors}
-
-
-def with_bg(settings, bg):
-    return settings._replace(bg=bg)
+    return scenes.without(scene, "shs") | {"colors_precomp": colors}
 
 
 def depths(scene, camera=CAMERA):
@@ -48,16 +46,13 @@ def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
     same steps; on CUDA, whose kernel for many channels adds up samples in another order, to rounding."""
     scene = scenes.cast(colored(scenes.random_scene(3, 50), channels), best)
     bg = torch.linspace(0.1, 0.9, channels, dtype=best)
-    settings = with_bg(CAMERA.settings(best, variant=variant), bg)
-    inputs = scenes.leaves(scenes.to(scene, device))
-    color, radii = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**inputs)
+    settings = CAMERA.settings(best, variant=variant)._replace(bg=bg)
+    color, radii = render(scenes.leaves(scene), settings, device)
     assert color.shape == (channels, 29, 37)
     for i in range(0, channels, 3):
-        pad = torch.nn.functional.pad
-        three = pad(scene["colors_precomp"][:, i : i + 3], (0, max(0, i + 3 - channels)))
-        alone = scenes.settings_to(with_bg(settings, pad(bg[i : i + 3], (0, max(0, i + 3 - channels)))), device)
-        single = scenes.leaves(scenes.to({**scene, "colors_precomp": three}, device))
-        expected, expected_radii = ar.GaussianRasterizer(alone)(**single)
+        colors, behind = (pad(t[..., i : i + 3], (0, max(0, i + 3 - channels))) for t in (scene["colors_precomp"], bg))
+        single = scenes.leaves(scene | {"colors_precomp": colors})
+        expected, expected_radii = render(single, settings._replace(bg=behind), device)
         # A pixel is a sum of products of at most 1 whose weights add up to 1.
         assert (color[i : i + 3] - expected[: channels - i]).abs().max() <= (0 if device == "cpu" else 1e-6)
         assert torch.equal(radii, expected_radii)
@@ -70,16 +65,13 @@ def test_outputs_match_the_reference(device, best, variant):
     scene = scenes.random_scene(5, 30, degree=1)
     z = depths(scene)
     colors = torch.stack([torch.ones_like(z), z, 1 / z], 1)
-    color, radii, outputs = render(scenes.cast(scene, best), dtype=best, device=device, footprint=footprint,
-                                   effects=ALL, **options)  # fmt: skip
-    plain = render(scenes.cast(scene, best), dtype=best, device=device, footprint=footprint, **options)
+    on_device = scenes.cast(scene, best, device)
+    color, radii, outputs = CAMERA.render(on_device, variant, effects=ALL)
+    plain = CAMERA.render(on_device, variant)
     assert torch.equal(radii, plain[1])
     assert (color - plain[0]).abs().max() <= (1e-6 if device == "cuda" else 0)  # one is ready for a backward pass
-    settings = CAMERA.settings(footprint=footprint, **options)
-    geometry = {k: v for k, v in scene.items() if k != "shs"}
-    expected = reference.render(
-        settings, **geometry, colors_precomp=torch.where(z[:, None] > 0.2, colors, 1), footprint=footprint, **options
-    ).color
+    shown = scenes.without(scene, "shs") | {"colors_precomp": torch.where(z[:, None] > 0.2, colors, 1)}
+    expected = reference.render(CAMERA.settings(variant=variant), **shown, footprint=footprint, **options).color
     # Rounding of the dtype times what adds up in a pixel; depths here are below 8.
     bound = {torch.float64: 1e-11, torch.float32: 2e-5}[best]
     for name, plane in zip(("alpha", "depth", "inverse_depth"), expected):
@@ -87,16 +79,15 @@ def test_outputs_match_the_reference(device, best, variant):
 
 
 def test_alpha_is_what_the_background_does_not_show(device, best):
-    scene = scenes.cast(scenes.random_scene(6, 30, degree=1), best)
-    black = render(scene, dtype=best, device=device, footprint="box:samples=4")[0]
-    settings = with_bg(CAMERA.settings(best, footprint="box:samples=4", effects=ALL), torch.ones(3, dtype=best))
-    white, _, outputs = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+    scene = scenes.cast(scenes.random_scene(6, 30, degree=1), best, device)
+    black = CAMERA.render(scene, footprint="box:samples=4")[0]
+    white, _, outputs = replace(CAMERA, bg=(1, 1, 1)).render(scene, footprint="box:samples=4", effects=ALL)
     assert torch.allclose(1 - outputs.alpha.expand_as(black), white - black, atol=4e-6)
 
 
 def test_normalized_depth_lies_between_the_nearest_and_the_farthest(device, best):
     scene = scenes.cast(scenes.random_scene(7, 60, degree=1, sigma=(0.2, 0.5)), best)
-    _, radii, outputs = render(scene, dtype=best, device=device, effects=ALL)
+    _, radii, outputs = CAMERA.render(scenes.to(scene, device), effects=ALL)
     mean = ar.normalized(outputs.depth, outputs.alpha)
     z = depths(scene)[radii.cpu() > 0]
     seen = mean[outputs.alpha > 1e-3]
@@ -110,15 +101,12 @@ def test_background_image(device, best):
     scene = scenes.cast(scenes.random_scene(8, 40, degree=1), best)
     image = torch.rand(3, 29, 37, generator=torch.Generator().manual_seed(1), dtype=best)
     settings = CAMERA.settings(best, footprint="box:samples=4")
-    color, _ = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, image), device))(**scenes.to(scene, device))
+    color, _ = render(scene, settings._replace(bg=image), device)
     for value in (image.new_tensor([0.2, 0.5, 0.7]), image.new_zeros(3)):
         constant = value[:, None, None].expand(3, 29, 37).contiguous()
-        one = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, value), device))(**scenes.to(scene, device))[0]
-        other = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, constant), device))(
-            **scenes.to(scene, device)
-        )[0]
+        one, other = (render(scene, settings._replace(bg=bg), device)[0] for bg in (value, constant))
         assert torch.allclose(one, other, atol=1e-6)
-    black = render(scene, dtype=best, device=device, footprint="box:samples=4", effects=ar.Effects(alpha=True))
+    black = render(scene, settings._replace(effects=ar.Effects(alpha=True)), device)
     assert torch.allclose(color, black[0] + (1 - black[2].alpha) * image.to(device), atol=1e-6)
 
 
@@ -129,17 +117,14 @@ def test_background_image(device, best):
 def test_gradients_add_up_over_the_groups(device, best, variant):
     """d/d(all channels) is the sum of what each group of three gives alone."""
     scene = scenes.cast(colored(scenes.random_scene(9, 60), 7), best)
-    settings = with_bg(CAMERA.settings(best, variant=variant), torch.linspace(0, 1, 7, dtype=best))
+    settings = CAMERA.settings(best, variant=variant)._replace(bg=torch.linspace(0, 1, 7, dtype=best))
     g = torch.rand(7, 29, 37, generator=torch.Generator().manual_seed(2), dtype=best)
     whole = scenes.leaves(scenes.to(scene, device))
-    ar.GaussianRasterizer(scenes.settings_to(settings, device))(**whole)[0].backward(g.to(device))
+    render(whole, settings, device)[0].backward(g.to(device))
     parts, total, size = scenes.leaves(scenes.to(scene, device)), {}, {}
     for i in range(0, 7, 3):
-        colors = torch.nn.functional.pad(parts["colors_precomp"][:, i : i + 3], (0, max(0, i - 4)))
-        bg = torch.nn.functional.pad(settings.bg[i : i + 3], (0, max(0, i - 4)))
-        image, _ = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, bg), device))(
-            **{**parts, "colors_precomp": colors}
-        )
+        colors, bg = (pad(t[..., i : i + 3], (0, max(0, i - 4))) for t in (parts["colors_precomp"], settings.bg))
+        image, _ = render(parts | {"colors_precomp": colors}, settings._replace(bg=bg), device)
         (image[: 7 - i] * g[i : i + 3].to(device)).sum().backward()
         for name, leaf in parts.items():
             if leaf.grad is not None:
@@ -166,7 +151,7 @@ def test_gradients_of_alpha(device, best, variant, count):
     others = scenes.leaves(scenes.to(scene, device))
     for value, sign in ((1.0, -1), (0.0, 1)):
         bg = torch.full((3,), value, dtype=best, device=device)
-        color, _ = ar.GaussianRasterizer(with_bg(settings, bg))(**others)
+        color, _ = ar.GaussianRasterizer(settings._replace(bg=bg))(**others)
         (sign * color[:1] * g).sum().backward()
     for name in ("means3D", "opacities", "scales", "rotations"):
         expected = others[name].grad
@@ -187,7 +172,7 @@ def test_gradcheck(footprint):
 
     def run(bg, *values):
         given = dict(zip(names, values))
-        color, _, outputs = ar.GaussianRasterizer(with_bg(settings, bg))(means2D=None, **given)
+        color, _, outputs = ar.GaussianRasterizer(settings._replace(bg=bg))(means2D=None, **given)
         return (color, *outputs[:3])
 
     inputs = [scene[name].clone().requires_grad_() for name in names]
@@ -202,8 +187,7 @@ def test_depth_gradient_of_a_culled_gaussian_is_zero(device, best):
     scene["means3D"][3] = 0
     scene["means3D"][4, 2] = -3
     leaves = scenes.leaves(scenes.to(scene, device))
-    settings = camera.settings(best, device, footprint="box", effects=ALL)
-    color, _, outputs = ar.GaussianRasterizer(settings)(**leaves)
+    color, _, outputs = camera.render(leaves, footprint="box", effects=ALL)
     (color.sum() + sum(output.sum() for output in outputs[:3])).backward()
     for name, leaf in leaves.items():
         assert leaf.grad.isfinite().all(), name
@@ -221,8 +205,7 @@ def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
     asked = (None, ar.Effects(), ar.Effects(alpha=True), ar.Effects(depth=True), ALL)
     for effects in asked:
         leaves = scenes.leaves(scenes.to(scene, device))
-        settings = CAMERA.settings(best, device, variant, effects=effects)
-        color, radii, *outputs = ar.GaussianRasterizer(settings)(**leaves)
+        color, radii, *outputs = CAMERA.render(leaves, variant, effects=effects)
         assert len(outputs) == (effects is not None and effects.has_outputs)
         color.square().sum().backward()
         results.append([color.detach(), radii, *(leaf.grad for leaf in leaves.values())])
@@ -234,13 +217,12 @@ def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
 
 def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
     scene = scenes.cast(colored(scenes.random_scene(13, 30), 6), best)
-    settings = with_bg(CAMERA.settings(best, footprint="box"), torch.zeros(6, dtype=best))
+    settings = CAMERA.settings(best, footprint="box")._replace(bg=torch.zeros(6, dtype=best))
     without = {k: torch.cat([v[:4], v[5:]]) for k, v in scene.items()}
     scene["colors_precomp"][4, 5] = torch.nan
     leaves = scenes.leaves(scenes.to(scene, device))
-    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, device))
-    color, radii = rasterizer(**leaves)
-    expected, _ = rasterizer(**scenes.leaves(scenes.to(without, device)))
+    color, radii = render(leaves, settings, device)
+    expected, _ = render(scenes.leaves(without), settings, device)
     assert torch.equal(color, expected)
     assert radii[4] == 0
     color.sum().backward()
@@ -253,9 +235,9 @@ def test_debug_names_the_channel_that_is_not_finite(device, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)  # where the snapshot goes
     scene = colored(scenes.cast(scenes.random_scene(13, 30), torch.float32), 6)
     scene["colors_precomp"][4, 5] = torch.nan
-    settings = with_bg(CAMERA.settings(torch.float32, footprint="box")._replace(debug=True), torch.zeros(6))
+    settings = CAMERA.settings(torch.float32, footprint="box")._replace(debug=True, bg=torch.zeros(6))
     with pytest.raises(ValueError, match=r"colors_precomp must be finite, got nan at \(4, 5\)"):
-        ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+        render(scene, settings, device)
 
 
 @pytest.mark.parametrize(
@@ -269,11 +251,10 @@ def test_debug_names_the_channel_that_is_not_finite(device, tmp_path, monkeypatc
     ],
 )
 def test_wrong_shapes(device, colors, bg, message):
-    scene = {k: v for k, v in scenes.cast(scenes.random_scene(1, 30), torch.float32).items() if k != "shs"}
-    scene["colors_precomp"] = torch.rand(*colors)
-    settings = with_bg(CAMERA.settings(torch.float32), torch.zeros(bg))
+    scene = scenes.cast(scenes.random_scene(1, 30), torch.float32)
+    scene |= {"shs": None, "colors_precomp": torch.rand(*colors)}
     with pytest.raises(ValueError, match=message):
-        ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+        render(scene, CAMERA.settings(torch.float32)._replace(bg=torch.zeros(bg)), device)
 
 
 @pytest.mark.parametrize("number", [math.nan, -math.inf])
@@ -308,9 +289,8 @@ def test_looks_match_the_weights(device, best, variant):
     scene = scenes.cast(colored(scenes.random_scene(14, count, opacity=(0.3, 0.98), sigma=(0.15, 0.6)), 3), best)
     scene["colors_precomp"] = torch.eye(count, dtype=best)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
-    settings = CAMERA.settings(best, device, variant, effects=looks)
-    settings = with_bg(settings, torch.zeros(count, dtype=best, device=device))
-    weights, _, outputs = ar.GaussianRasterizer(settings)(**scenes.to(scene, device))
+    settings = CAMERA.settings(best, variant=variant, effects=looks)._replace(bg=torch.zeros(count, dtype=best))
+    weights, _, outputs = render(scene, settings, device)
     weights, eps = weights.cpu(), 32 * torch.finfo(best).eps
     assert outputs.alpha is outputs.depth is None
 
@@ -355,9 +335,7 @@ def test_looks_do_not_depend_on_each_other(device, best, variant):
     looks = ("median_depth", "dominant_index", "gaussian_stats")
 
     def outputs(*names):
-        effects = ar.Effects(**dict.fromkeys(names, True))
-        settings = CAMERA.settings(best, device, variant, effects=effects)
-        return ar.GaussianRasterizer(settings)(**scene)[2]
+        return CAMERA.render(scene, variant, effects=ar.Effects(**dict.fromkeys(names, True)))[2]
 
     together = outputs(*looks)
     assert (together.median_depth > 0).any() and (together.median_depth == 0).any()
@@ -371,19 +349,18 @@ def test_looks_do_not_depend_on_each_other(device, best, variant):
 def test_looks_do_not_depend_on_threads_or_runs():
     scene = scenes.random_scene(15, 200, degree=1)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
-    results = []
-    for threads in (1, 2, 5, 2):
-        torch.set_num_threads(threads)
-        _, _, outputs = render(scene, footprint="box:samples=4", effects=looks)
-        results.append([outputs.median_depth, outputs.dominant_index, *outputs.gaussian_stats])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+    def results():
+        _, _, outputs = CAMERA.render(scene, footprint="box:samples=4", effects=looks)
+        return outputs.median_depth, outputs.dominant_index, *outputs.gaussian_stats
+
+    same_on_threads(results, (1, 2, 5, 2))
 
 
 def test_looks_of_an_empty_picture(device, best):
-    scene = {k: v[:0] for k, v in scenes.cast(scenes.random_scene(1, 5, degree=1), best).items()}
+    scene = scenes.cast(scenes.random_scene(1, 0, degree=1), best, device)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True, alpha=True, depth=True)
-    color, _, outputs = render(scene, dtype=best, device=device, effects=looks)
+    color, _, outputs = CAMERA.render(scene, effects=looks)
     assert color.abs().max() == 0 and outputs.alpha.abs().max() == 0 and outputs.median_depth.abs().max() == 0
     assert (outputs.dominant_index == -1).all()
     assert all(len(field) == 0 for field in outputs.gaussian_stats)

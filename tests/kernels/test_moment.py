@@ -16,8 +16,7 @@ CELLS = (1, 4, 16)
 
 def image_of(camera, scene, device="cpu", **footprint):
     inputs = scenes.cast(scene, torch.float32 if device == "cuda" else torch.float64, device)
-    settings = camera.settings(inputs["means3D"].dtype, device, **footprint)
-    return ar.GaussianRasterizer(settings)(**inputs)[0].double().cpu()
+    return camera.render(inputs, **footprint)[0].double().cpu()
 
 
 def integral_of(camera, scene, density):
@@ -55,14 +54,11 @@ def test_one_splat_is_its_weight(device, best, samples):
     camera = Camera(image_width=20, image_height=18).facing_z()
     cov2d = torch.tensor([[3.0, 1.0, 2.0]], dtype=torch.float64)
     mean = torch.tensor([[9.3, 8.1]], dtype=torch.float64)
-    scene = scenes.splat_scene(camera, mean, cov2d, torch.tensor([0.8]).to(mean), torch.tensor([2.0]).to(mean))
-    scene = {k: v for k, v in scene.items() if k != "means2D"} | {"means2D": None}
-    inputs = {k: None if v is None else v.to(device, best) for k, v in scene.items()}
-    settings = camera.settings(best, device, footprint="moment", samples=samples)
-    color = ar.GaussianRasterizer(settings)(**inputs)[0].double().cpu()
+    scene = scenes.cast(scenes.splat_scene(camera, mean, cov2d, [0.8], [2.0]), best, device) | {"means2D": None}
+    color = camera.render(scene, footprint="moment", samples=samples)[0].double().cpu()
     y, x = torch.meshgrid(torch.arange(18.0), torch.arange(20.0), indexing="ij")
     offset = torch.stack([x, y], -1).double() - mean[0]
-    alphas = torch.tensor(0.8).to(mean) * reference.sample_weights(offset, cov2d[0], "moment", samples=samples)
+    alphas = 0.8 * reference.sample_weights(offset, cov2d[0], "moment", samples=samples)
     expected = torch.where(alphas >= reference.ALPHA_MIN, alphas, 0).mean(0)
     clear = ((alphas / reference.ALPHA_MIN - 1).abs() > 1e-3).all(0)
     assert clear.double().mean() > 0.95
@@ -84,7 +80,7 @@ def test_long_lists(device, dtype, samples):
     opacities, depths = scenes.rand(g, count, low=0.0055, high=0.007), scenes.rand(g, count, low=1.0, high=3.0)
     colors = scenes.rand(g, count, 3)
     scene = scenes.splat_scene(camera, means, cov2d, opacities, depths, colors)
-    scene = {name: value.to(device, dtype) for name, value in scene.items() if name != "means2D"}
+    scene = scenes.without(scenes.cast(scene, dtype, device), "means2D")
     splats = ar.project(camera.settings(dtype, device, footprint="moment", samples=samples), **scene)
     results = []
     for size in (16, 3):

@@ -126,21 +126,16 @@ def withhold():
 
 @pytest.mark.parametrize("name", _C.IMAGES)
 def test_an_image_that_the_device_does_not_write_is_refused(device, name, withhold):
-    def render(effects):
-        settings = Camera().settings(torch.float32, device, effects=effects)
-        return ar.GaussianRasterizer(settings)(**scene)
-
     scene = scenes.cast(scenes.random_scene(1, 20), torch.float32, device)
-    expected = render(IMAGES)[0]
+    expected = Camera().render(scene, effects=IMAGES)[0]
     withhold(name)
     with pytest.raises(NotImplementedError, match=f"^{name} cannot be made on {device} yet"):
-        render(IMAGES)
-    assert torch.equal(render(replace(IMAGES, **{name: False}))[0], expected)
+        Camera().render(scene, effects=IMAGES)
+    assert torch.equal(Camera().render(scene, effects=replace(IMAGES, **{name: False}))[0], expected)
 
 
 def test_stages_refuse_an_alpha_that_the_device_does_not_write(device, withhold):
-    scene = scenes.cast(scenes.random_scene(1, 20), torch.float32, device)
-    del scene["means2D"]
+    scene = scenes.without(scenes.cast(scenes.random_scene(1, 20), torch.float32, device), "means2D")
     splats = ar.project(Camera().settings(torch.float32, device), **scene)
     lists = ar.list_tiles(splats)
     withhold("alpha")
@@ -150,8 +145,7 @@ def test_stages_refuse_an_alpha_that_the_device_does_not_write(device, withhold)
 
 @pytest.mark.parametrize("name", _C.SUMMARY)
 def test_statistics_that_the_device_does_not_write_are_refused(device, name, withhold):
-    settings = Camera().settings(torch.float32, device, effects=EVERYTHING)
     scene = scenes.cast(scenes.random_scene(1, 20), torch.float32, device)
     withhold(name)
     with pytest.raises(NotImplementedError, match=f"^{name} cannot be made on {device} yet"):
-        ar.GaussianRasterizer(settings)(**scene)
+        Camera().render(scene, effects=EVERYTHING)

@@ -46,9 +46,7 @@ def test_needed_degree_renders_within_the_tolerance(device, best, scales):
     images = {}
     for used in {degree, 3, max(0, degree - 1)}:
         camera = Camera(image_height=29, image_width=37, sh_degree=used)
-        images[used] = ar.GaussianRasterizer(camera.settings(best, device, footprint="box"))(
-            **scenes.to(scene, device)
-        )[0]
+        images[used] = camera.render(scenes.to(scene, device), footprint="box")[0]
     assert (images[degree] - images[3]).abs().max() <= 1 / 255
     if degree > 0:  # and one degree less shows
         assert (images[degree - 1] - images[3]).abs().max() > 1 / 255
@@ -75,18 +73,16 @@ def test_bad_numbers_and_arguments():
     shs = torch.zeros(5, 16, 3)
     shs[2, 12, 0] = torch.nan
     assert ar.needed_sh_degree(shs) == 3
-    with pytest.raises(
-        ValueError, match=r"shs must have shape \(P, M, 3\) with M = 1, 4, 9, 16 or 25, got \(5, 8, 3\)"
+    shapes = r"shs must have shape \(P, M, 3\) with M = 1, 4, 9, 16 or 25, got \(5, 8, 3\)"
+    for arguments, error, message in (
+        ((shs[:, :8],), ValueError, shapes),
+        ((shs, -1), ValueError, "tolerance must be finite and not negative, got -1"),
+        ((shs, None), TypeError, "tolerance must be a number, got None"),
+        (([1.0],), TypeError, "shs must be a tensor, got list"),
+        ((shs.long(),), TypeError, "shs must have a floating-point dtype, got torch.int64"),
     ):
-        ar.needed_sh_degree(shs[:, :8])
-    with pytest.raises(ValueError, match="tolerance must be finite and not negative, got -1"):
-        ar.needed_sh_degree(shs, -1)
-    with pytest.raises(TypeError, match="tolerance must be a number, got None"):
-        ar.needed_sh_degree(shs, None)
-    with pytest.raises(TypeError, match="shs must be a tensor, got list"):
-        ar.needed_sh_degree([1.0])
-    with pytest.raises(TypeError, match=r"shs must have a floating-point dtype, got torch.int64"):
-        ar.needed_sh_degree(shs.long())
+        with pytest.raises(error, match=message):
+            ar.needed_sh_degree(*arguments)
 
 
 def test_a_negative_degree_is_named_under_auto():

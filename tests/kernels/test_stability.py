@@ -100,11 +100,8 @@ def test_hard_case_against_the_reference(case, variant):
         actual, wanted = hard_cases.rows(leaf.grad), hard_cases.rows(there)
         error = hard_cases.rows(leaf.grad - there)
         # The reference's quaternions: a difference of terms of the size of the scales' gradient.
-        floor = (
-            hard_cases.rows(theirs["scales"].grad.nan_to_num()) * hard_cases.rows(scene["scales"])
-            if name == "rotations"
-            else 0
-        )
+        terms = hard_cases.rows(theirs["scales"].grad.nan_to_num()) * hard_cases.rows(scene["scales"])
+        floor = terms if name == "rotations" else 0
         assert (error <= 1e-8 * (wanted + floor) + 1e-14 * size).all(), (name, error, actual, wanted)
 
 
@@ -118,24 +115,22 @@ def test_a_colour_of_exactly_zero_has_a_gradient(device, best):
     black = next(c for c in (-0.5 / zero, *candidates) if c * zero + 0.5 == 0)
     scene["shs"][1, 0] = black.to(device)
     leaves = scenes.leaves(scene)
-    color, _ = ar.GaussianRasterizer(camera.settings(best, device, footprint="mip"))(**leaves)
-    color.sum().backward()
+    camera.render(leaves, footprint="mip")[0].sum().backward()
     assert (leaves["shs"].grad[1, 0] > 0).all()
 
 
 def test_equal_depths_keep_their_order(device):
     """As given: the image of two splats at one depth changes when they are swapped, and only then."""
     camera, scene = hard_cases.equal_depths()
-    settings = camera.settings(torch.float32, device, footprint="mip")
     scene = scenes.cast(scene, torch.float32, device)
-    image = ar.GaussianRasterizer(settings)(**scene)[0]
+    image = camera.render(scene, footprint="mip")[0]
     # Behind one another by as little as float32 can tell, in that order.
     spread = dict(scene, means3D=scene["means3D"].clone())
     for i in range(4):
         spread["means3D"][i] *= 1 + i * 2.0**-22
-    assert (ar.GaussianRasterizer(settings)(**spread)[0] - image).abs().max() < 1e-4
+    assert (camera.render(spread, footprint="mip")[0] - image).abs().max() < 1e-4
     swapped = {name: value.flip(0) for name, value in scene.items()}
-    assert (ar.GaussianRasterizer(settings)(**swapped)[0] - image).abs().max() > 1e-2
+    assert (camera.render(swapped, footprint="mip")[0] - image).abs().max() > 1e-2
 
 
 def available_memory():
@@ -156,8 +151,7 @@ def test_image_of_16384_x_16384():
     means = [[0.0, 0.0], [n - 1.0, n - 1.0], [n - 1.0, 0.0], [8191.5, 8192.25]]
     scene = hard_cases.splats(means, [[1.5, 1.5]] * 4, 0.0, 0.8, 2.0, camera)
     with torch.no_grad():
-        settings = camera.settings(torch.float32, footprint="mip")
-        image, radii = ar.GaussianRasterizer(settings)(**scenes.cast(scene, torch.float32))
+        image, radii = camera.render(scenes.cast(scene, torch.float32), footprint="mip")
     assert image.shape == (3, n, n)
     assert (radii > 0).all()
     exact = hard_cases.settings_of(camera, torch.float64, torch.float32, ("mip", {}))
@@ -196,15 +190,11 @@ def weight_in_40_digits(offset, cov2d, footprint, options):
         return gaussian(x, y, mp.mpf(options.get("dilation", 0.3)), False)
     if footprint == "mip":
         return gaussian(x, y, mp.mpf(options.get("variance", 0.1)))
-    if footprint == "box":
+    if footprint in ("box", "moment"):
         samples = options["samples"]
-        v = mp.mpf(1) / (12 if samples == 1 else 24 * samples)
-        nodes = reference.box_nodes(samples).tolist()
-        return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
-    if footprint == "moment":
-        nodes, samples = reference.cell_nodes(options["samples"]).tolist(), options["samples"]
-        v = mp.mpf(1) / (12 * samples)
-        return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
+        v = mp.mpf(1) / (24 * samples if footprint == "box" and samples > 1 else 12 * samples)
+        nodes = reference.box_nodes(samples) if footprint == "box" else reference.cell_nodes(samples)
+        return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes.tolist()) / samples
     if footprint == "cumulant":
         v = mp.mpf(1) / 12
         det = (xx + v) * (yy + v) - xy * xy
@@ -266,17 +256,13 @@ def hard_weights():
     """Covariances (n, 3) [px^2] and offsets (n, 2) [px]: every size, ratio and angle of the battery."""
     shapes = [(s, s, 0.0) for s in (1e-6, 1e-3, 0.05, 0.3, 1.0, 30.0, 1e3, 1e6)]
     shapes += [(1.0, 1 + 1e-7, 0.7), (0.2, 0.2 * (1 + 1e-7), 1.9), (3, 1, 0), (1, 3, 0), (0.3, 0.05, 0.4)]
-    shapes += [(30, 0.03, angle) for angle in (0, 0.4, math.pi / 2)] + [
-        (300, 1e-3, 1.2),
-        (1e3, 1, 2.5),
-        (30, 3e-5, 0.9),
-    ]
+    shapes += [(30, 0.03, angle) for angle in (0, 0.4, math.pi / 2)]
+    shapes += [(300, 1e-3, 1.2), (1e3, 1, 2.5), (30, 3e-5, 0.9)]
     long, across, angle = torch.tensor(shapes, dtype=torch.float64).unbind(-1)
     cov2d = scenes.covariance_2d(long, across, angle)
     axes = torch.stack([torch.cos(angle), torch.sin(angle)], -1)
-    offsets = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.31, -0.22], [1.7, 0.6]], dtype=torch.float64).expand(
-        len(shapes), 4, 2
-    )
+    offsets = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.31, -0.22], [1.7, 0.6]], dtype=torch.float64)
+    offsets = offsets.expand(len(shapes), 4, 2)
     along = torch.stack([2 * axes * long[:, None].clamp(max=1e3), axes * long[:, None].clamp(max=20) + 0.2], 1)
     offsets = torch.cat([offsets, along], 1)
     return offsets.reshape(-1, 2), cov2d.repeat_interleave(6, 0)
@@ -362,8 +348,7 @@ def test_a_quaternion_of_zeros_and_a_nan_is_culled(variant, device, dtype, colum
     camera, scene = visible(dtype, device)
     scene["rotations"][2] = 0.0
     scene["rotations"][2, column] = math.nan
-    settings = camera.settings(dtype, device, footprint=variant[0], **variant[1])
-    assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
+    assert camera.render(scene, variant)[1].tolist()[2] == 0
 
 
 BLURS = ar.Effects(defocus=ar.Defocus(0.1, 1.0), motion=ar.Motion(1.0, screen_velocity=(7.0, 5.0)))
@@ -380,8 +365,7 @@ def test_a_negative_covariance_is_culled(variant, device, dtype, variance, effec
     scene["means3D"][2, :2] = 0.0  # straight ahead, where the variance along the line of sight adds nothing
     size = (2.0 / hard_cases.FOCAL) ** 2  # 1 px^2
     scene["cov3D_precomp"][2] = torch.tensor([variance, 0, 0, variance, 0, 9.0]) * size
-    settings = camera.settings(dtype, device, footprint=variant[0], effects=effects, **variant[1])
-    assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
+    assert camera.render(scene, variant, effects=effects)[1].tolist()[2] == 0
 
 
 @each_path
@@ -402,11 +386,10 @@ def test_a_flat_covariance_has_no_mass_under_a_blur(variant, device, dtype, prec
     else:
         scene["scales"][3] = 0.0
     scene = scenes.cast(scene, dtype, device)
-    settings = camera.settings(dtype, device, footprint=variant[0], effects=BLURS, **variant[1])
 
     def gradients(some):
         leaves = scenes.leaves(some)
-        color, radii = ar.GaussianRasterizer(settings)(**leaves)
+        color, radii = camera.render(leaves, variant, effects=BLURS)
         (color**2).sum().backward()
         return color.detach(), radii.tolist(), {name: leaf.grad for name, leaf in leaves.items()}
 
@@ -424,16 +407,12 @@ def test_a_needle_given_by_its_covariance_is_kept(device, best):
     angles = torch.linspace(0.1, 3.0, 20, dtype=torch.float64)
     scene = hard_cases.splats([[20.3, 11.6]], torch.tensor([[30.0, 30.0e-5]]).expand(20, 2), angles, 0.9)
     camera = hard_cases.CAMERA
-    settings = camera.settings(best, device, footprint="point")
     for i in range(20):
         one = {name: value[i : i + 1].float() for name, value in scene.items()}
-        entries = {
-            name: value.float() for name, value in hard_cases.flat({k: v.double() for k, v in one.items()}).items()
-        }
-        one["colors_precomp"] = entries["colors_precomp"]
-        del one["shs"]
-        expected, _ = ar.GaussianRasterizer(settings)(**scenes.cast(one, best, device))
-        image, radii = ar.GaussianRasterizer(settings)(**scenes.cast(entries, best, device))
+        entries = scenes.cast(hard_cases.flat(scenes.cast(one, torch.float64)), torch.float32)
+        one = scenes.without(one, "shs") | {"colors_precomp": entries["colors_precomp"]}
+        expected, _ = camera.render(scenes.cast(one, best, device), footprint="point")
+        image, radii = camera.render(scenes.cast(entries, best, device), footprint="point")
         assert radii[0] > 0
         # Rounding moves Sigma by 2^-24 30^2 = 5e-5 px^2 across, of 0.3: alpha by 2e-4 of itself; 1/255 where it flips.
         assert (image - expected).abs().max() < 1.1 / 255
@@ -510,10 +489,8 @@ def test_a_camera_that_sees_nothing_is_no_error(device):
     """A singular projection, every Gaussian behind: the background, and zero gradients."""
     camera, scene = visible(torch.float32, device)
     settings = camera.settings(torch.float32, device)
-    behind = Camera(image_width=9, image_height=7, eye=(0.0, 0.0, 50.0), target=(0.0, 0.0, 60.0)).settings(
-        torch.float32, device
-    )
-    for s in (settings._replace(projmatrix=torch.zeros(4, 4, device=device)), behind):
+    away = Camera(image_width=9, image_height=7, eye=(0.0, 0.0, 50.0), target=(0.0, 0.0, 60.0))
+    for s in (settings._replace(projmatrix=torch.zeros(4, 4, device=device)), away.settings(torch.float32, device)):
         leaves = scenes.leaves(scene)
         color, radii = ar.GaussianRasterizer(s)(**leaves)
         assert torch.equal(color, s.bg[:, None, None].expand_as(color))

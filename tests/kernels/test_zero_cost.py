@@ -203,9 +203,8 @@ OTHER_EFFECTS = {
     "filter_3d": lambda dtype, device: {"filter_3d": torch.zeros(COUNT, dtype=dtype, device=device)},
     "sh_degree": lambda *_: {"sh_degree": 1},
 }
-OUTPUT_EFFECTS = {name: lambda *_, name=name: {name: True} for name in OUTPUTS} | {
-    "all_outputs": lambda *_: ALL_OUTPUTS
-}
+OUTPUT_EFFECTS = {name: lambda *_, name=name: {name: True} for name in OUTPUTS}
+OUTPUT_EFFECTS["all_outputs"] = lambda *_: ALL_OUTPUTS
 each_camera_effect = pytest.mark.parametrize("name", CAMERA_EFFECTS)
 
 
@@ -247,11 +246,9 @@ def render(scene, variant, effects, dtype, device, loss=("color",)):
     """Everything that comes of it by name; with gradients by the Gaussians of a loss on the images named, if any."""
     settings = CAMERA.settings(dtype, device, variant, effects=effects)
     if effects is not None and effects.camera_gradients:
-        leaves = {
-            name: getattr(settings, name).clone().requires_grad_() for name in ("viewmatrix", "projmatrix", "campos")
-        }
+        matrices = {name: getattr(settings, name) for name in ("viewmatrix", "projmatrix", "campos")}
         tangents = {name: tensor(getattr(settings, name), dtype, device) for name in ("tanfovx", "tanfovy")}
-        settings = settings._replace(**leaves, **tangents)
+        settings = settings._replace(**scenes.leaves(matrices), **tangents)
     inputs = scenes.leaves(scenes.cast(scene, dtype, device))
     with torch.set_grad_enabled(bool(loss)):
         color, radii, *rest = ar.GaussianRasterizer(settings)(**inputs)
