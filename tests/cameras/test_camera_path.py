@@ -199,7 +199,7 @@ def test_a_film_has_the_frames(files, capsys):
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     out = files / "new" / "film.MP4"
     assert render(files, "--path", "orbit", "--frames", 6, "--fps", 12, "--scales", 0.5, "--out", out) == 0
-    assert capsys.readouterr().out == f"{out}: 6 pictures, 0.5 s\n"
+    assert capsys.readouterr().out == f"{out}: 6 pictures of 66x50, 0.5 s\n"
     reader = ffmpeg.read_frames(str(out))
     about = next(reader)
     frames = [np.frombuffer(frame, np.uint8).reshape(50, 66, 3) for frame in reader]

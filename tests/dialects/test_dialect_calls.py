@@ -125,10 +125,8 @@ def test_settings_of_a_class_of_the_program(name):
     own.bg = own.bg + 0.25  # it is read anew in every call
     assert not torch.equal(rasterizer(**scene)[0], render(name)[0])
     if name == "mini":
-        assert_same(
-            tuple(rasterizer.render_depth(**scene).values()),
-            tuple(rasterizer_of(name, settings_of(name, bg=own.bg)).render_depth(**scene).values()),
-        )
+        expected = rasterizer_of(name, settings_of(name, bg=own.bg)).render_depth(**scene)
+        assert_same(rasterizer.render_depth(**scene).values(), expected.values())
 
 
 @each_dialect
@@ -179,16 +177,16 @@ def test_autocast_rounds_nothing(name):
     settings = full_settings(name, subpixel_offset=torch.full((30, 40, 2), 0.25))
     scene = full_arguments(name)
     rasterizer = rasterizer_of(name, settings)
-    of_scene = lambda: [rasterizer.markVisible(scene["means3D"])]  # noqa: E731
-    if name == "mini":
-        of_scene = lambda: [rasterizer.markVisible(scene["means3D"]), *rasterizer.render_depth(**scene).values()]  # noqa: E731
-    expected, expected_gradients = gradients(name, settings, scene)
-    expected = [*expected, *of_scene()]
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+
+    def results():
         made, found = gradients(name, settings, scene)
-        made = [*made, *of_scene()]
+        depths = rasterizer.render_depth(**scene).values() if name == "mini" else ()
+        return [*made, rasterizer.markVisible(scene["means3D"]), *depths, *found.values()]
+
+    expected = results()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        made = results()
     assert_same(made, expected)
-    assert_same(list(found.values()), list(expected_gradients.values()))
 
 
 @each_dialect
@@ -207,8 +205,7 @@ def test_defaults_of_the_program(name, mode):
     finally:
         torch.set_default_device(None)
         torch.set_default_dtype(torch.float32)
-    assert_same(made, expected)
-    assert_same(list(found.values()), list(expected_gradients.values()))
+    assert_same([*made, *found.values()], [*expected, *expected_gradients.values()])
 
 
 def test_relocation_under_another_default_device():

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+import scenes
 import torch
 from marks import needs_cuda
 from originals import CAMERA, render, scene_of, settings_of
@@ -22,8 +23,7 @@ def test_mip_takes_no_offset_for_zero(device):
 @pytest.mark.parametrize("x, y", [(0.3, -0.2), (-0.5, 0.0), (0.0, 1.25)])
 def test_mip_offset_of_all_pixels_against_its_definition(device, x, y):
     """A Gaussian's weight in a pixel whose centre is moved, and the same gradient as where the mean is moved."""
-    one = {name: tensor[:1] for name, tensor in scene_of(device).items() if name != "means2D"}
-    del one["shs"]
+    one = {name: tensor[:1] for name, tensor in scenes.without(scene_of(device), "means2D", "shs").items()}
     one["colors_precomp"] = torch.ones(1, 3, device=device)
     settings = settings_of("mip", device, bg=torch.zeros(3, device=device))
     splat = ar.project(CAMERA.settings(torch.float32, device), **one)
@@ -77,17 +77,17 @@ def test_mip_looks_at_a_tensor_once(device, monkeypatch, inference):
     for step in range(3):
         offset += 0.25
         assert mip._offset_of(offset, shape, debug=False) == (0.25 * (step + 1),) * 2
-    looks.clear()
-    for _ in range(20):  # one was not zero: all are looked at
-        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
-    assert len(looks) == 20
+
+    def looks_at(count, debug=False):
+        looks.clear()
+        for _ in range(count):
+            mip._offset_of(torch.zeros(shape, device=device), shape, debug=debug)
+        return len(looks)
+
+    assert looks_at(20) == 20  # one was not zero: all are looked at
     mip._looks_left = mip._LOOKS
-    looks.clear()
-    for _ in range(20):
-        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
-    assert len(looks) == (mip._LOOKS if device == "cuda" else 20)
-    mip._offset_of(torch.zeros(shape, device=device), shape, debug=True)
-    assert len(looks) == (mip._LOOKS + 1 if device == "cuda" else 21)
+    assert looks_at(20) == (mip._LOOKS if device == "cuda" else 20)
+    assert looks_at(1, debug=True) == 1
 
 
 # --- offsets that are looked at later ------------------------------------------------------------

@@ -86,11 +86,8 @@ def truth(offset, cov2d):
 
     hess_xy = change(lambda u: f(u, ends_y[1]) - f(u, ends_y[0]), ends_x)
     # f without a normalising amplitude: dI/dSigma = (Sigma^-1 I + Hessian I) / 2
-    by_cov = (
-        (a * value + change(across_column, ends_x)) / 2,
-        b * value + hess_xy,
-        (c * value + change(across_row, ends_y)) / 2,
-    )
+    hess_xx, hess_yy = change(across_column, ends_x), change(across_row, ends_y)
+    by_cov = (a * value + hess_xx) / 2, b * value + hess_xy, (c * value + hess_yy) / 2
     return value, (change(on_column, ends_x), change(on_row, ends_y)), by_cov
 
 

@@ -58,14 +58,8 @@ def start(kind):
 def inputs_of(parameters):
     """Keyword inputs of the rasterizer, differentiable in the parameters."""
     means, log_scales, rotations, logits, colors = parameters.split(PARTS, -1)
-    return {
-        "means3D": means,
-        "means2D": torch.zeros_like(means),
-        "opacities": torch.sigmoid(logits),
-        "colors_precomp": colors,
-        "scales": torch.exp(log_scales),
-        "rotations": rotations,
-    }
+    activated = {"opacities": torch.sigmoid(logits), "scales": torch.exp(log_scales), "rotations": rotations}
+    return activated | {"means3D": means, "means2D": torch.zeros_like(means), "colors_precomp": colors}
 
 
 @functools.cache
@@ -148,12 +142,8 @@ def test_gradients_along_a_path(device, variant, kind):
     for point, parameters in zip(POINTS, path(kind), strict=True):
         scene = {name: value.detach() for name, value in inputs_of(parameters).items()}
         for camera in CAMERAS[point % 2 :: 2]:
-            case = Case(
-                f"{kind}, step {point}, {camera.image_width} px",
-                "",
-                lambda camera=camera, scene=scene: (camera, scene),
-                round=kind == "isotropic" and point == 0,
-            )
+            name, is_round = f"{kind}, step {point}, {camera.image_width} px", kind == "isotropic" and point == 0
+            case = Case(name, "", lambda camera=camera, scene=scene: (camera, scene), round=is_round)
             report = hard_cases.measure(case, variant, device, torch.float32)
             assert report.finite, report.describe()
             if variant[0] == "analytic":

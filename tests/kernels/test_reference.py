@@ -51,14 +51,9 @@ def test_exact_weight_derivatives_are_heat_equation():
     hess_y = torch.autograd.grad(first[:, 1].sum(), offset, retain_graph=True)[0]
     xx, xy, yy = cov2d.unbind(-1)
     det = reference.determinant(cov2d)
-    expected = torch.stack(
-        [
-            (yy / det * value + hess_x[:, 0]) / 2,
-            -xy / det * value + hess_x[:, 1],  # S12 stands for both off-diagonal entries
-            (xx / det * value + hess_y[:, 1]) / 2,
-        ],
-        -1,
-    )
+    by_xx, by_yy = (yy / det * value + hess_x[:, 0]) / 2, (xx / det * value + hess_y[:, 1]) / 2
+    by_xy = -xy / det * value + hess_x[:, 1]  # S12 stands for both off-diagonal entries
+    expected = torch.stack([by_xx, by_xy, by_yy], -1)
     assert (by_cov - expected).abs().max() < 1e-10
 
 
@@ -78,11 +73,8 @@ def test_frozen_window_is_the_integral_over_a_window_that_stays():
     inside = torch.stack([turned[:, 0, 0], turned[:, 0, 1], turned[:, 1, 1]], -1)
     truth = reference.exact_weight((axes.transpose(-1, -2) @ offset[..., None])[..., 0], inside)
     assert (frozen - truth).abs().max() < 1e-13
-    for ours, theirs in zip(
-        torch.autograd.grad(frozen.sum(), (offset, cov2d)),
-        torch.autograd.grad(truth.sum(), (offset, cov2d)),
-        strict=True,
-    ):
+    gradients = (torch.autograd.grad(total.sum(), (offset, cov2d)) for total in (frozen, truth))
+    for ours, theirs in zip(*gradients, strict=True):
         assert (ours - theirs).abs().max() < 1e-11 * max(1, theirs.abs().max())
 
 
@@ -147,10 +139,12 @@ def test_projection_is_the_linearised_pinhole():
     means = scenes.rand(g, 5, 3, low=-0.5, high=0.5)
     covariance = reference.covariance_3d(scenes.rand(g, 5, 3), scenes.rand(g, 5, 4), 1.0)
     projection = reference.project(settings, means, covariance)
+
+    def position(mean):
+        return reference.project(settings, mean[None], covariance[:1]).means2d[0]
+
     for i in range(5):
-        derivative = torch.autograd.functional.jacobian(
-            lambda p: reference.project(settings, p[None], covariance[:1]).means2d[0], means[i]
-        )
+        derivative = torch.autograd.functional.jacobian(position, means[i])
         full = derivative @ covariance[i] @ derivative.T
         expected = torch.stack([full[0, 0], full[0, 1], full[1, 1]])
         assert (projection.cov2d[i] - expected).abs().max() < 1e-11 * full.abs().max()

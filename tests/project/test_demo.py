@@ -51,9 +51,8 @@ def test_stamps_land_where_they_are_drawn():
     rows, columns = torch.meshgrid(torch.arange(256.0), torch.arange(384.0), indexing="ij")
     columns, rows = columns - 99.5, rows - 59.5
     weight = dark * (columns.abs() < 40)
-    sxx, sxy, syy = (
-        ((a * b * weight).sum() / weight.sum()).item() for a, b in ((columns, columns), (columns, rows), (rows, rows))
-    )
+    products = columns * columns, columns * rows, rows * rows
+    sxx, sxy, syy = (((product * weight).sum() / weight.sum()).item() for product in products)
     turn = 0.5 * np.arctan2(2 * sxy, sxx - syy)
     assert turn == pytest.approx(0.5, abs=0.02)  # x towards y
 
@@ -81,9 +80,8 @@ def test_errors_are_those_of_the_written_pictures(demo_run):
     for entry in results["pictures"]:
         reduction = entry["reduction"]
         name = entry["footprint"].replace(":samples=", "")
-        picture, truth = (
-            np.asarray(image.open(out / f"{stem}_{reduction}.png")) / 255.0 for stem in (name, "reference")
-        )
+        files = (out / f"{stem}_{reduction}.png" for stem in (name, "reference"))
+        picture, truth = (np.asarray(image.open(file)) / 255.0 for file in files)
         assert picture.shape == (SIZE[1] // reduction, SIZE[0] // reduction, 3)
         rounding = 1 / 255  # of both pictures, half a step each
         assert np.sqrt(np.square(picture - truth).mean()) == pytest.approx(entry["rmse"], abs=rounding)
@@ -100,10 +98,8 @@ def test_footprints_rank_as_they_should():
     scene, view = demo.make_target()
     truth = demo._reduced(reference.supersampled(scene, view, 8, background=demo.PAPER))
     for reduction in (1, 2):
-        psnr = {
-            name: demo._errors(demo._render(scene, view, 1 / reduction, name)[0], truth[reduction])[0]
-            for name in demo.COLUMNS
-        }
+        pictures = {name: demo._render(scene, view, 1 / reduction, name)[0] for name in demo.COLUMNS}
+        psnr = {name: demo._errors(picture, truth[reduction])[0] for name, picture in pictures.items()}
         single = {psnr[name] for name in ("mip", "analytic", "cumulant", "box:samples=1")}
         assert psnr["point"] < min(single) - 10
         assert psnr["box:samples=4"] > max(single) + 5

@@ -82,11 +82,8 @@ def test_a_program_does_not_find_what_only_begins_like_a_prefix_or_is_the_projec
     root, standard = ROOT, os.path.dirname(os.__file__)
     monkeypatch.setattr(sys, "prefix", str(root.parent))
     like_it = f"{root.parent}-old"
-    monkeypatch.setattr(
-        sys,
-        "path",
-        [str(root / "tests" / "makers"), str(root / "tests"), str(root), like_it, str(root.parent), standard],
-    )
+    project = [str(root / "tests" / "makers"), str(root / "tests"), str(root)]
+    monkeypatch.setattr(sys, "path", [*project, like_it, str(root.parent), standard])
     assert processes._search_path(["here"], {}) == ["here", str(root.parent), standard]
 
 

@@ -171,14 +171,8 @@ def write_points(path):
 def make_nerfstudio(folder):
     files.write_pictures(folder / "images", VIEWS, opaque=True)
     frames = [{"file_path": f"images/{v.name}.png", "transform_matrix": files.opengl_pose(v)} for v in VIEWS]
-    camera = {
-        "w": SIZE[0],
-        "h": SIZE[1],
-        "fl_x": VIEWS[0].fx,
-        "fl_y": VIEWS[0].fy,
-        "cx": SIZE[0] / 2,
-        "cy": SIZE[1] / 2,
-    }
+    camera = {"w": SIZE[0], "h": SIZE[1], "fl_x": VIEWS[0].fx, "fl_y": VIEWS[0].fy}
+    camera |= {"cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
     (folder / "transforms.json").write_text(json.dumps(camera | {"frames": frames}))
     write_points(folder / "points3D.ply")
 
@@ -350,16 +344,14 @@ def test_old_scene(tmp_path):
     bakings = [output for command, output in reader.output.items() if " bake " in command]
     assert len(bakings) == 2 and all("40x32" in stdout for stdout, _ in bakings)
     assert io.read_metadata(model / "baked.ply").footprint == "moment:samples=4"
-    shown = {name: picture(tmp_path / f"{name}/r_0.png") for name in ("before/scale_1", "before/scale_4")}
-    shown |= {name: picture(tmp_path / f"{name}/r_0.png") for name in ("after/scale_1", "after/scale_4")}
+    folders = [f"{when}/scale_{scale}" for when in ("before", "after") for scale in (1, 4)]
+    shown = {name: picture(tmp_path / f"{name}/r_0.png") for name in folders}
     small = shown["before/scale_1"].reshape(8, 4, 10, 4, 3).mean((1, 3))
     off = {name: np.abs(shown[f"{name}/scale_4"] - small).mean() for name in ("before", "after")}
     assert off["after"] < 0.3 * off["before"]
     assert np.abs(shown["after/scale_1"] - shown["before/scale_1"]).mean() < 0.3 * off["before"]
-    results = [
-        json.loads((model / name).read_text())["results"]
-        for name in ("evaluation.json", "baked_evaluation/evaluation.json")
-    ]
+    files_of_results = model / "evaluation.json", model / "baked_evaluation" / "evaluation.json"
+    results = [json.loads(file.read_text())["results"] for file in files_of_results]
     before, after = results[0]["point:dilation=0.3"], results[1]["moment:samples=4"]
     assert all(after[scale]["psnr"] > before[scale]["psnr"] + 3 for scale in ("2", "4", "8"))
     assert any("PSNR" in stdout for command, (stdout, _) in reader.output.items() if " inspect " in command)

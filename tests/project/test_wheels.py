@@ -32,13 +32,8 @@ PIP["PIP_CONFIG_FILE"] = os.devnull
 def distribution(name, version, *required):
     """The files of an installed distribution, by their names."""
     info = f"{name}-{version}.dist-info"
-    lines = [
-        "Metadata-Version: 2.1",
-        f"Name: {name}",
-        f"Version: {version}",
-        "Requires-Python: >=3.10",
-        *(f"Requires-Dist: {text}" for text in required),
-    ]
+    lines = ["Metadata-Version: 2.1", f"Name: {name}", f"Version: {version}", "Requires-Python: >=3.10"]
+    lines += [f"Requires-Dist: {text}" for text in required]
     tags = "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     return {f"{info}/METADATA": "\n".join(lines) + "\n", f"{info}/WHEEL": tags, f"{info}/RECORD": ""}
 
