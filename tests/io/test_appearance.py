@@ -35,9 +35,8 @@ def options_json(footprint, scales=(1,), background=None, **described):
     """What a training writes; without a background, what one of an earlier version wrote."""
     options = TrainingOptions(footprint=footprint, scales=scales).to_dict()
     described |= {} if background is None else {"background": background}
-    return json.dumps(
-        {"source": {"scene": "/none", "images": "images", "test_every": 8}, "options": options} | described
-    )
+    source = {"scene": "/none", "images": "images", "test_every": 8}
+    return json.dumps({"source": source, "options": options} | described)
 
 
 FILTERED = {"filter_3D": 0.02}  # a scene as Mip-Splatting and Analytic-Splatting write it
@@ -68,96 +67,92 @@ def write(folder, contents):
             io.save_scene(path, make_scene(degree=0), io.SceneMetadata(**(content or {})))
 
 
-MOMENT, BOX, MARKED, POINT = (
-    {"footprint": "moment:samples=4"}, {"footprint": "box:samples=16"}, {"antialiased": True}, {"footprint": "point"}
-)  # fmt: skip
-OF_MOMENT = {"background": [0, 0, 0], "footprint": "moment:samples=4"}
-# Files, SCENE, the environment, --footprint, and what is chosen with a part of the reason.
+MOMENT, BOX = {"footprint": "moment:samples=4"}, {"footprint": "box:samples=16"}
+MARKED, POINT = {"antialiased": True}, {"footprint": "point"}
+BLACK = [0, 0, 0]
+
+
+def training(scene, footprint, name="scene.ply", **described):
+    """A scene beside the options of a training."""
+    return {name: scene, "options.json": options_json(footprint, **described)}
+
+
+def choice(contents, footprint, reason, scene=None, environment=None, given=None):
+    """Files, what is chosen with a part of the reason, SCENE (the first of the files), the environment, --footprint."""
+    return contents, scene or next(iter(contents)), environment, given, footprint, reason
+
+
+def beside_args(name, content, kernel_size):
+    """A scene beside cfg_args."""
+    return {name: content, "cfg_args": f"Namespace(kernel_size={kernel_size})"}
+
+
 CHOICES = {
-    "nothing said": ({"a.ply": None}, "a.ply", None, None, UNMARKED, "a.ply names none, and 3DGS trains with it"),
-    "baking is named": ({"a.ply": None}, "a.ply", None, None, UNMARKED, "for others: bake "),
-    "the user": ({"a.ply": MOMENT}, "a.ply", "mip", "point:dilation=0", "point:dilation=0.0", "as given"),
-    "the environment": ({"a.ply": MOMENT}, "a.ply", "mip", None, MIP, "ANALYTIC_RASTERIZER_FOOTPRINT says so"),
-    "an empty environment": ({"a.ply": MOMENT}, "a.ply", "", None, "moment:samples=4", "a.ply says so"),
-    "thin Gaussians": ({"a.ply": None}, "a.ply", "moment", None, "moment:samples=4", "too thin for moment, so first"),
-    "thin by the tag": ({"a.ply": POINT}, "a.ply", None, "box", "box:samples=4", "its Gaussians are too thin"),
-    "own tag": ({"a.ply": BOX}, "a.ply", None, None, "box:samples=16", "a.ply says so"),
-    "own tag of point": ({"a.ply": POINT}, "a.ply", None, None, UNMARKED, "a.ply says so; right at the size of"),
-    "tag of others": ({"a.ply": MARKED}, "a.ply", None, None, MIP, "antialiasing filter, and not which"),
-    "beside an unbaked one": ({"a.ply": None, "b.ply": BOX}, "b.ply", None, None, "box:samples=16", "b.ply says so"),
-    "compressed": ({"a.compressed.ply": BOX}, "a.compressed.ply", None, None, "box:samples=16", "says so"),
-    "spz": ({"a.spz": BOX}, "a.spz", None, None, "box:samples=16", "a.spz says so"),
-    "unmarked spz": ({"a.spz": None}, "a.spz", None, None, UNMARKED, "a.spz names none"),
-    "flag of spz": ({"a.spz": MARKED}, "a.spz", None, None, MIP, "antialiasing filter, and not which"),
-    "suffix in capitals": ({"a.PLY": BOX}, "a.PLY", None, None, "box:samples=16", "says so"),
-    "a training": (
-        {"scene.ply": MOMENT, "options.json": options_json("moment", background=[1, 1, 1])},
-        ".", None, None, "moment:samples=4", "scene.ply says so",
+    "nothing said": choice({"a.ply": None}, UNMARKED, "a.ply names none, and 3DGS trains with it"),
+    "baking is named": choice({"a.ply": None}, UNMARKED, "for others: bake "),
+    "the user": choice(
+        {"a.ply": MOMENT}, "point:dilation=0.0", "as given", environment="mip", given="point:dilation=0"
     ),
-    "a training before tags": (
-        {"scene.ply": MARKED, "options.json": options_json("box:samples=1")},
-        "scene.ply", None, None, "box:samples=1", "options.json beside scene.ply says so",
+    "the environment": choice({"a.ply": MOMENT}, MIP, "ANALYTIC_RASTERIZER_FOOTPRINT says so", environment="mip"),
+    "an empty environment": choice({"a.ply": MOMENT}, "moment:samples=4", "a.ply says so", environment=""),
+    "thin Gaussians": choice(
+        {"a.ply": None}, "moment:samples=4", "too thin for moment, so first", environment="moment"
     ),
-    "point, before tags": (
-        {"scene.ply": None, "options.json": options_json("point:dilation=0.1")},
-        "scene.ply", None, None, "point:dilation=0.1", "options.json beside scene.ply says so; right at",
+    "thin by the tag": choice({"a.ply": POINT}, "box:samples=4", "its Gaussians are too thin", given="box"),
+    "own tag": choice({"a.ply": BOX}, "box:samples=16", "a.ply says so"),
+    "own tag of point": choice({"a.ply": POINT}, UNMARKED, "a.ply says so; right at the size of"),
+    "tag of others": choice({"a.ply": MARKED}, MIP, "antialiasing filter, and not which"),
+    "beside an unbaked one": choice({"b.ply": BOX, "a.ply": None}, "box:samples=16", "b.ply says so"),
+    "compressed": choice({"a.compressed.ply": BOX}, "box:samples=16", "says so"),
+    "spz": choice({"a.spz": BOX}, "box:samples=16", "a.spz says so"),
+    "unmarked spz": choice({"a.spz": None}, UNMARKED, "a.spz names none"),
+    "flag of spz": choice({"a.spz": MARKED}, MIP, "antialiasing filter, and not which"),
+    "suffix in capitals": choice({"a.PLY": BOX}, "box:samples=16", "says so"),
+    "a training": choice(
+        training(MOMENT, "moment", background=[1, 1, 1]), "moment:samples=4", "scene.ply says so", "."
     ),
-    "the environment and a training": (
-        {"scene.ply": MARKED, "options.json": options_json("box")}, "scene.ply", "mip", None, MIP, "ANALYTIC",
+    "a training before tags": choice(
+        training(MARKED, "box:samples=1"), "box:samples=1", "options.json beside scene.ply says so"
     ),
-    "another name": (
-        {"other.ply": MARKED, "options.json": options_json("box")}, "other.ply", None, None, MIP, "and not which",
+    "point, before tags": choice(
+        training(None, "point:dilation=0.1"),
+        "point:dilation=0.1",
+        "options.json beside scene.ply says so; right at",
     ),
-    "a foreign scene over it": (
-        {"scene.ply": None, "options.json": options_json("moment")}, "scene.ply", None, None, UNMARKED, "names none",
+    "the environment and a training": choice(training(MARKED, "box"), MIP, "ANALYTIC", environment="mip"),
+    "another name": choice(training(MARKED, "box", "other.ply"), MIP, "and not which"),
+    "a foreign scene over it": choice(training(None, "moment"), UNMARKED, "names none"),
+    "a foreign one over point": choice(training(MARKED, "point"), MIP, "and not which"),
+    "a foreign marked one": choice(training(MARKED, "moment", background=BLACK), MIP, "and not which"),
+    "a baked one over it": choice(training(BOX, "point", background=BLACK), "box:samples=16", "scene.ply says so"),
+    "options of another program": choice({"scene.ply": MARKED, "options.json": "[3]"}, MIP, "and not which"),
+    "the mip of a training": choice(
+        training({"footprint": "point:dilation=0"}, "moment", "point_cloud_mip.ply"),
+        "point:dilation=0.0",
+        "point_cloud_mip.ply says so",
     ),
-    "a foreign one over point": (
-        {"scene.ply": MARKED, "options.json": options_json("point")}, "scene.ply", None, None, MIP, "and not which",
-    ),
-    "a foreign marked one": (
-        {"scene.ply": MARKED, "options.json": options_json("moment", background=[0, 0, 0])},
-        "scene.ply", None, None, MIP, "and not which",
-    ),
-    "a baked one over it": (
-        {"scene.ply": BOX, "options.json": options_json("point", background=[0, 0, 0])},
-        "scene.ply", None, None, "box:samples=16", "scene.ply says so",
-    ),
-    "options of another program": (
-        {"scene.ply": MARKED, "options.json": "[3]"}, "scene.ply", None, None, MIP, "and not which",
-    ),
-    "the mip of a training": (
-        {"point_cloud_mip.ply": {"footprint": "point:dilation=0"}, "options.json": options_json("moment")},
-        "point_cloud_mip.ply", None, None, "point:dilation=0.0", "point_cloud_mip.ply says so",
-    ),
-    "without dilation": ({"a.ply": None}, "a.ply", None, "point:dilation=0", "point:dilation=0.0", "too thin"),
-    "a name with spaces": ({"a b.ply": None}, "a b.ply", None, None, UNMARKED, "a b.ply' --out FILE"),
-    "a model": ({DEEP: None}, "MODEL", None, None, UNMARKED, "point_cloud.ply names none"),
-    "a model of Mip-Splatting": (
+    "without dilation": choice({"a.ply": None}, "point:dilation=0.0", "too thin", given="point:dilation=0"),
+    "a name with spaces": choice({"a b.ply": None}, UNMARKED, "a b.ply' --out FILE"),
+    "a model": choice({DEEP: None}, UNMARKED, "point_cloud.ply names none", "MODEL"),
+    "a model of Mip-Splatting": choice(
         {DEEP: FILTERED, "MODEL/cfg_args": "Namespace(kernel_size=0.1)"},
-        "MODEL", None, None, MIP, "cfg_args says kernel_size 0.1, the variance of Mip-Splatting's filter",
+        MIP,
+        "cfg_args says kernel_size 0.1, the variance of Mip-Splatting's filter",
+        "MODEL",
     ),
-    "its fused file": (
-        {"fused.ply": None, "cfg_args": "Namespace(kernel_size=0.3)"},
-        "fused.ply", None, None, "mip:variance=0.3", "cfg_args says kernel_size 0.3",
-    ),
-    "one of its kin": (
-        {"a.ply": FILTERED, "cfg_args": "Namespace(kernel_size=0.0)"},
-        "a.ply", None, None, "mip:variance=0.0", "cfg_args says kernel_size 0,",
-    ),
-    "its file alone": ({"a.ply": FILTERED}, "a.ply", None, None, MIP, "column filter_3D of Mip-Splatting"),
-    "Analytic-Splatting": (
+    "its fused file": choice(beside_args("fused.ply", None, 0.3), "mip:variance=0.3", "cfg_args says kernel_size 0.3"),
+    "one of its kin": choice(beside_args("a.ply", FILTERED, 0.0), "mip:variance=0.0", "cfg_args says kernel_size 0,"),
+    "its file alone": choice({"a.ply": FILTERED}, MIP, "column filter_3D of Mip-Splatting"),
+    "Analytic-Splatting": choice(
         {DEEP: FILTERED, "MODEL/cfg_args": "Namespace(load_allres=False)"},
-        "MODEL", None, None, MIP, "Analytic-Splatting writes it too, then give --footprint analytic",
+        MIP,
+        "Analytic-Splatting writes it too, then give --footprint analytic",
+        "MODEL",
     ),
-    "a baked file beside kernel_size": (
-        {"a.ply": MOMENT, "cfg_args": "Namespace(kernel_size=0.1)"},
-        "a.ply", None, None, "moment:samples=4", "a.ply says so",
-    ),
-    "the width of a blur": (
-        {"a.ply": None, "cfg_args": "Namespace(kernel_size=9)"}, "a.ply", None, None, UNMARKED, "names none",
-    ),
-    "a baked model": ({DEEP: MOMENT}, DEEP, None, None, "moment:samples=4", "point_cloud.ply says so"),
-}  # fmt: skip
+    "a baked file beside kernel_size": choice(beside_args("a.ply", MOMENT, 0.1), "moment:samples=4", "a.ply says so"),
+    "the width of a blur": choice(beside_args("a.ply", None, 9), UNMARKED, "names none"),
+    "a baked model": choice({DEEP: MOMENT}, "moment:samples=4", "point_cloud.ply says so"),
+}
 
 
 @pytest.mark.filterwarnings("ignore:.*it is not what `train` writes", "ignore:.*kernel_size is ignored, got 9")
@@ -193,39 +188,30 @@ def test_a_scene_comes_back_as_it_is_from_every_format(tmp_path, footprint, firs
 
 CFG = "Namespace(sh_degree=3, source_path='/data/garden', model_path='./output/1', {}, data_device='cuda', eval=True)"
 WHITE_CFG = CFG.format("images='images_4', resolution=-1, white_background=True")
+MODEL = {"MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG}
+ITERATION, BAKED = "MODEL/point_cloud/iteration_30000", "MODEL/point_cloud/iteration_7/b.ply"
+BESIDE = {"a.ply": None, "cameras.json": (64, 48), "cfg_args": WHITE_CFG}
+TRAINED = training(MOMENT, "moment", scales=(2, 4), background=[1, 1, 1])
+OTHER = training(None, "moment", "b.ply", background=[0, 0.5, 1])
 # Files, SCENE, the size of the views, the background.
 FOLDERS = {
-    "a model": ({DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG}, "MODEL", (16, 12), "white"),
-    "its file": ({DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG}, DEEP, (16, 12), "white"),
-    "its iteration": (
-        {DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG},
-        "MODEL/point_cloud/iteration_30000", (16, 12), "white",
-    ),
-    "its point_cloud": (
-        {DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG},
-        "MODEL/point_cloud", (16, 12), "white",
-    ),
-    "baked in it": (
-        {"MODEL/point_cloud/iteration_7/b.ply": MOMENT, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG},
-        "MODEL/point_cloud/iteration_7/b.ply", (16, 12), "white",
-    ),
-    "beside": ({"a.ply": None, "cameras.json": (64, 48), "cfg_args": WHITE_CFG}, "a.ply", (16, 12), "white"),
+    "a model": ({DEEP: None} | MODEL, "MODEL", (16, 12), "white"),
+    "its file": ({DEEP: None} | MODEL, DEEP, (16, 12), "white"),
+    "its iteration": ({DEEP: None} | MODEL, ITERATION, (16, 12), "white"),
+    "its point_cloud": ({DEEP: None} | MODEL, "MODEL/point_cloud", (16, 12), "white"),
+    "baked in it": ({BAKED: MOMENT} | MODEL, BAKED, (16, 12), "white"),
+    "beside": (BESIDE, "a.ply", (16, 12), "white"),
     "beside goes first": (
-        {DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/point_cloud/iteration_30000/cameras.json": (32, 24)},
-        "MODEL", (32, 24), None,
+        {DEEP: None, "MODEL/cameras.json": (64, 48), f"{ITERATION}/cameras.json": (32, 24)},
+        "MODEL",
+        (32, 24),
+        None,
     ),
     "without cfg_args": ({DEEP: None, "MODEL/cameras.json": (64, 48)}, "MODEL", (64, 48), None),
-    "a training": (
-        {"scene.ply": MOMENT, "cameras.json": (64, 48),
-         "options.json": options_json("moment", scales=(2, 4), background=[1, 1, 1])},
-        ".", (32, 24), "white",
-    ),
-    "another scene beside a training": (
-        {"b.ply": None, "cameras.json": (64, 48), "options.json": options_json("moment", background=[0, 0.5, 1])},
-        "b.ply", (64, 48), "0,0.5,1",
-    ),
+    "a training": (TRAINED | {"cameras.json": (64, 48)}, ".", (32, 24), "white"),
+    "another scene beside a training": (OTHER | {"cameras.json": (64, 48)}, "b.ply", (64, 48), "0,0.5,1"),
     "not two folders up": ({"MODEL/x/y/a.ply": None, "MODEL/cameras.json": (64, 48)}, "MODEL/x/y/a.ply", None, None),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", FOLDERS)
@@ -285,7 +271,7 @@ def test_views_are_in_the_frame_of_the_scene(tmp_path):
 
 @pytest.mark.parametrize("scene", ["../iteration_30000/point_cloud.ply", "..", "link.ply", "cut/../../iteration_30000"])
 def test_a_model_is_found_through_dots_and_links(tmp_path, monkeypatch, scene):
-    write(tmp_path, {DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG})
+    write(tmp_path, {DEEP: None} | MODEL)
     here = tmp_path / "MODEL" / "point_cloud" / "iteration_7"
     (here / "cut").mkdir(parents=True)
     (here / "link.ply").symlink_to(tmp_path / DEEP)
@@ -385,9 +371,8 @@ def run(arguments):
 @pytest.fixture
 def model(tmp_path):
     """A model of 3DGS whose pictures had a quarter of the size in cameras.json."""
-    contents = {DEEP: None, "MODEL/cameras.json": (256, 192)}
-    contents["MODEL/cfg_args"] = CFG.format("images='images', resolution=4, white_background=True")
-    write(tmp_path, contents)
+    args = CFG.format("images='images', resolution=4, white_background=True")
+    write(tmp_path, {DEEP: None, "MODEL/cameras.json": (256, 192), "MODEL/cfg_args": args})
     return tmp_path / "MODEL"
 
 

@@ -71,72 +71,6 @@ def test_ply_by_hand(tmp_path, degree):
             torch.testing.assert_close(scene.shs[:, 1 + band, channel], expected)
 
 
-def test_ply_in_another_order_with_other_floats(tmp_path):
-    columns = ply_columns(1, extra=("confidence",))
-    rows = random_rows(columns)
-    straight = io.load_scene(write_ply(tmp_path / "a.ply", columns, rows))
-    turned = io.load_scene(write_ply(tmp_path / "b.ply", columns[::-1], rows[:, ::-1]))
-    for left, right in zip(straight[:-1], turned[:-1]):
-        assert torch.equal(left, right)
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_ply_round_trip(tmp_path, degree):
-    scene = random_gaussians(degree=degree)
-    io.save_scene(tmp_path / "scene.ply", scene)
-    loaded = io.load_scene(tmp_path / "scene.ply")
-    assert loaded.sh_degree == degree
-    assert torch.equal(loaded.means, scene.means)
-    assert torch.equal(loaded.shs, scene.shs)
-    torch.testing.assert_close(loaded.scales, scene.scales)
-    torch.testing.assert_close(loaded.rotations, scene.rotations)
-    torch.testing.assert_close(loaded.opacities, scene.opacities)
-
-
-def turned_by(a, b):
-    """Largest 1 - |cos| between quaternions: their sign does not matter."""
-    return (1 - (a * b).sum(1).abs()).max().item()
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_compressed_ply_round_trip(tmp_path, degree):
-    scene = random_gaussians(degree=degree)
-    io.save_scene(tmp_path / "scene.compressed.ply", scene)
-    assert (tmp_path / "scene.compressed.ply").read_bytes().count(b"packed_position") == 1
-    loaded = io.load_scene(tmp_path / "scene.compressed.ply")
-    assert loaded.sh_degree == degree
-    # Half a step of the fewest bits that a component gets, over the range of all Gaussians.
-    extent = (scene.means.amax() - scene.means.amin()).item()
-    assert (loaded.means - scene.means).abs().max() <= 0.5 / 1023 * extent * 1.001
-    logs = scene.scales.log()
-    extent = (logs.amax() - logs.amin()).item()
-    assert (loaded.scales.log() - logs).abs().max() <= 0.5 / 1023 * extent * 1.001
-    assert (loaded.opacities - scene.opacities).abs().max() <= 0.5 / 255 * 1.001
-    # Three components at 10 bits over sqrt(2); the fourth follows from the unit length.
-    assert turned_by(loaded.rotations, scene.rotations) <= 3 * (0.5 / 1023 * math.sqrt(2)) ** 2 * 4
-    # Colours at 8 bits over the range of a chunk; higher bands in steps of 1/32.
-    extent = (scene.shs[:, 0].amax() - scene.shs[:, 0].amin()).item()
-    assert (loaded.shs[:, 0] - scene.shs[:, 0]).abs().max() <= 0.5 / 255 * extent * 1.001
-    if degree:
-        assert (loaded.shs[:, 1:] - scene.shs[:, 1:]).abs().max() <= 1.001 / 32
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_spz_round_trip(tmp_path, degree):
-    scene = random_gaussians(degree=degree)
-    io.save_scene(tmp_path / "scene.spz", scene)
-    loaded = io.load_scene(tmp_path / "scene.spz")
-    assert loaded.sh_degree == degree
-    assert (loaded.means - scene.means).abs().max() <= 0.501 / 2**12
-    assert (loaded.scales.log() - scene.scales.log()).abs().max() <= 0.501 / 16
-    assert (loaded.opacities - scene.opacities).abs().max() <= 0.501 / 255
-    # Three components at 9 bits and a sign over sqrt(1/2); the fourth follows.
-    assert turned_by(loaded.rotations, scene.rotations) <= 3 * (0.5 / 511 * math.sqrt(0.5)) ** 2 * 4
-    assert (loaded.shs[:, 0] - scene.shs[:, 0]).abs().max() <= 0.501 / (0.15 * 255)
-    if degree:
-        assert (loaded.shs[:, 1:] - scene.shs[:, 1:]).abs().max() <= 0.501 / 128
-
-
 @pytest.mark.parametrize("name", ["scene.ply", "scene.compressed.ply", "scene.spz"])
 def test_scene_without_gaussians(tmp_path, name):
     io.save_scene(tmp_path / name, random_gaussians(degree=0).rows(slice(0)))
@@ -216,17 +150,8 @@ def test_save_scene_refuses_other_suffixes(tmp_path):
         io.save_scene(tmp_path / "scene.obj", random_gaussians())
 
 
-def broken(name, write):
-    return pytest.param(write, id=name)
-
-
 def cut(path, keep):
     path.write_bytes(path.read_bytes()[:keep])
-    return path
-
-
-def with_bytes(path, old, new):
-    path.write_bytes(path.read_bytes().replace(old, new))
     return path
 
 
@@ -253,55 +178,19 @@ def text_file(tmp_path, name, text):
     return tmp_path / name
 
 
-POINT_CLOUD = ["x", "y", "z", "nx", "ny", "nz"]
-
-
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         (lambda d: d / "none.ply", "no such file"),
-        (lambda d: d, "expected a file of a scene, got a folder"),
         (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got"),
-        (lambda d: text_file(d, "a.ply", ""), "does not begin with 'ply'"),
-        (lambda d: text_file(d, "a.ply", "plyx\nformat"), "does not begin with 'ply'"),
-        (lambda d: text_file(d, "a.ply", "ply\nformat ascii 1.0\n"), "no end_header"),
-        (lambda d: text_file(d, "a.ply", "ply\nend_header\n"), "got none"),
-        (lambda d: hand_written(d, form="binary"), "binary_little_endian, binary_big_endian, got binary"),
         (lambda d: hand_written(d, form="ascii"), "cut short|17 numbers in every row"),
-        (
-            lambda d: text_file(d, "a.ply", "ply\nformat binary_little_endian 1.0\nend_header\n"),
-            "expected vertices, but the .ply has none",
-        ),
-        (
-            lambda d: hand_written(d, columns=POINT_CLOUD),
-            "missing vertex properties f_dc_0, f_dc_1, f_dc_2, opacity, scale_0, .*rot_3",
-        ),
         (
             lambda d: hand_written(d, columns=[c for c in ply_columns(0) if c != "opacity"]),
             "missing vertex properties opacity;",
         ),
-        (
-            lambda d: hand_written(d, columns=[*ply_columns(0), "f_rest_0"]),
-            r"0, 9, 24, 45 or 72 f_rest properties .*got 1",
-        ),
-        (lambda d: cut(hand_written(d), -1), "cut short"),
-        (
-            lambda d: with_bytes(hand_written(d), b"element vertex 5", b"element vertex 99999999999"),
-            r"expected a number of vertices that fits \d+ bytes, got 99999999999",
-        ),
-        (lambda d: cut(saved(d, "a.compressed.ply"), -1), "cut short"),
         (lambda d: cut(saved(d, "a.compressed.ply"), 3000), "cut short"),
-        (
-            lambda d: with_bytes(saved(d, "a.compressed.ply"), b"element vertex ", b"element vertex 9999999999"),
-            r"expected a number of vertices that fits \d+ bytes, got 9999999999\d",
-        ),
         (lambda d: cut(saved(d, "a.spz"), -20), "cut short .Could not gunzip"),
         (lambda d: text_file(d, "a.spz", "not a scene"), "Not an SPZ file"),
-        (lambda d: with_value(d, "y", np.nan), "means must be finite, got 2 of 5"),
-        (lambda d: with_value(d, "scale_1", 1000), "scales must be finite, got 2 of 5"),
-        (lambda d: with_value(d, "rot_2", np.inf), "rotations must be finite, got 2 of 5"),
-        (lambda d: with_value(d, "opacity", np.nan), "opacities must be finite, got 2 of 5"),
-        (lambda d: with_value(d, "f_rest_8", np.nan), "shs must be finite, got 2 of 5"),
     ],
 )
 def test_scenes_that_cannot_be_used(tmp_path, write, message):
@@ -351,16 +240,8 @@ def opengl_to_world():
 
 
 LISTED = {"width": 120, "height": 80, "fx": 110.0, "fy": 105.0, "w2c": world_to_camera().tolist()}
-CAMERA = {
-    "id": 0,
-    "img_name": "left/0001.jpg",
-    "width": 120,
-    "height": 80,
-    "position": POSITION.tolist(),
-    "rotation": ROTATION.tolist(),
-    "fx": 110.0,
-    "fy": 105.0,
-}
+CAMERA = {"id": 0, "img_name": "left/0001.jpg", "width": 120, "height": 80, "position": POSITION.tolist()}
+CAMERA |= {"rotation": ROTATION.tolist(), "fx": 110.0, "fy": 105.0}
 FRAME = {"file_path": "./train/r_0", "transform_matrix": opengl_to_world().tolist()}
 TRANSFORMS = {"w": 120, "h": 80, "fl_x": 110.0, "fl_y": 105.0, "frames": [FRAME]}
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from ply_files import ply, vertices
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
@@ -142,31 +143,28 @@ def write_transforms(path, frames, **shared):
 
 
 def test_lenses_of_nerfstudio(tmp_path):
-    frames = [
-        frame(),
-        frame(camera_model="OPENCV", k1=-0.1, k2=0.02, k3=0.01, p1=0.001, p2=0.002),
-        frame(camera_model="OPENCV_FISHEYE", k1=0.01, k2=0.0, k3=-0.02, k4=0.003),
-        frame(camera_model="OPENCV_FISHEYE", k1=0, k2=0, k3=0, k4=0),
-        frame(camera_model="PINHOLE", k1=0.0),
-        frame(is_fisheye=True, k1=0.01),
-        frame(camera_model="FULL_OPENCV", k1=-0.1, k4=0.01),
-        frame(camera_model="EQUIRECTANGULAR"),
-        frame(camera_model="OPENCV_FISHEYE", is_fisheye=True, k1=0.01),
-        frame(camera_model="EQUIRECTANGULAR", is_fisheye=False),
+    perspective, fisheye, sphere = ar.Lens.perspective, ar.Lens.fisheye, ar.Lens.equirectangular()
+    expected = [
+        ({}, None),
+        (
+            {"camera_model": "OPENCV", "k1": -0.1, "k2": 0.02, "k3": 0.01, "p1": 0.001, "p2": 0.002},
+            perspective((-0.1, 0.02, 0.01), (0.001, 0.002)),
+        ),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.0, "k3": -0.02, "k4": 0.003},
+            fisheye((0.01, 0.0, -0.02, 0.003)),
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0, "k2": 0, "k3": 0, "k4": 0}, fisheye()),
+        ({"camera_model": "PINHOLE", "k1": 0.0}, None),
+        ({"is_fisheye": True, "k1": 0.01}, fisheye((0.01,))),
+        ({"camera_model": "FULL_OPENCV", "k1": -0.1, "k4": 0.01}, perspective((-0.1, 0, 0, 0.01))),
+        ({"camera_model": "EQUIRECTANGULAR"}, sphere),
+        ({"camera_model": "OPENCV_FISHEYE", "is_fisheye": True, "k1": 0.01}, fisheye((0.01,))),
+        ({"camera_model": "EQUIRECTANGULAR", "is_fisheye": False}, sphere),
     ]
+    frames = [frame(**members) for members, _ in expected]
     views = io.load_views(write_transforms(tmp_path / "transforms.json", frames))
-    assert [view.lens for view in views] == [
-        None,
-        ar.Lens.perspective((-0.1, 0.02, 0.01), (0.001, 0.002)),
-        ar.Lens.fisheye((0.01, 0.0, -0.02, 0.003)),
-        ar.Lens.fisheye(),
-        None,
-        ar.Lens.fisheye((0.01,)),
-        ar.Lens.perspective((-0.1, 0, 0, 0.01)),
-        ar.Lens.equirectangular(),
-        ar.Lens.fisheye((0.01,)),
-        ar.Lens.equirectangular(),
-    ]
+    assert [view.lens for view in views] == [lens for _, lens in expected]
     assert views[-1].fx == pytest.approx(640 / (2 * math.pi)) and views[-1].middle == (320, 240)
     shared = write_transforms(tmp_path / "shared.json", [frame(), frame(k1=0.2)], camera_model="OPENCV", k1=-0.1)
     assert [view.lens.coefficients[0] for view in io.load_views(shared)] == [-0.1, 0.2]
@@ -289,9 +287,7 @@ def test_training_with_lenses(tmp_path, lens):
             )
         levels = (255 * shown.clamp(0, 1)).round().byte().permute(1, 2, 0).numpy()
         image.fromarray(levels).save(tmp_path / frame_of["file_path"])
-    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
-    header += [f"property float {name}" for name in "xyz"] + ["end_header"]
-    (tmp_path / "sparse_pc.ply").write_text("\n".join([*header, *(f"{x} {y} {z}" for x, y, z in points.tolist()), ""]))
+    (tmp_path / "sparse_pc.ply").write_bytes(ply(vertices("xyz", points), layout="ascii"))
     options = training.TrainingOptions(iterations=400, density="none", sh_degree=0)
     run = training.Run(tmp_path, tmp_path / "out", options)
     before = run.evaluate()["test"]["mean"]["psnr"]

@@ -80,19 +80,13 @@ def test_scenes_whatever_the_file(tmp_path, name):
     assert io.is_scene(path)
     scene = io.load_scene(path, strict=True)
     column = dict(zip(SCENE_COLUMNS, torch.from_numpy(rows.T.copy())))
-    expected = Gaussians(
-        torch.stack([column[axis] for axis in "xyz"], 1),
-        torch.stack([column[f"scale_{i}"] for i in range(3)], 1),
-        torch.stack([column[f"rot_{i}"] for i in range(4)], 1),
-        column["opacity"][:, None],
-        torch.stack(
-            [
-                torch.stack([column[f"f_dc_{channel}"], *(column[f"f_rest_{3 * channel + i}"] for i in range(3))], 1)
-                for channel in range(3)
-            ],
-            2,
-        ),
-    )
+
+    def stack(*names):
+        return torch.stack([column[name] for name in names], 1)
+
+    rest = [stack(f"f_dc_{k}", *(f"f_rest_{3 * k + i}" for i in range(3))) for k in range(3)]  # of each channel
+    turns, sizes = stack("rot_0", "rot_1", "rot_2", "rot_3"), stack("scale_0", "scale_1", "scale_2")
+    expected = Gaussians(stack(*"xyz"), sizes, turns, stack("opacity"), torch.stack(rest, 2))
     for found, wanted in zip(scene, expected):
         assert found.dtype == torch.float32 and found.is_contiguous()
         assert torch.equal(found, wanted)
@@ -182,16 +176,13 @@ REFUSED = {
     "no end": (ply(SCENE).partition(b"end_header")[0], "no end_header"),
     "an endless header": (b"ply\n" + b"comment a\n" * 200_000, "no end_header"),
     "no format": (ply(SCENE).replace(b"format binary_little_endian 1.0\n", b""), "expected format ascii, .*, got none"),
-    "another format": (ply(SCENE).replace(b"_little_", b"_middle_"), "got binary_middle_endian"),
+    "another format": (ply(SCENE).replace(b"_little_", b"_middle_"), "binary_big_endian, got binary_middle_endian"),
     "no vertices": (ply(CAMERA), "expected vertices, but the .ply has none"),
     "one byte too few": (ply(SCENE)[:-1], CUT + "5"),
     "one line too few": (TEXT.rsplit(b"\n", 2)[0], "cut short: expected 5 vertices, got 4"),
     "one word too few": (TEXT.rsplit(b" ", 1)[0], "expected 23 numbers in every row"),
     "no number": (TEXT.replace(b"\n0.", b"\nfour 0."), "expected 23 numbers in every row"),
-    "too large a number": (
-        BYTES.replace(b" 255\n", b" 256\n"),
-        "expected 24 numbers in every row",
-    ),
+    "too large a number": (BYTES.replace(b" 255\n", b" 256\n"), "expected 24 numbers in every row"),
     "a huge number of vertices": (ply(SCENE).replace(b"vertex 5", b"vertex 4000000000"), CUT + "4000000000"),
     "a number that is none": (ply(SCENE).replace(b"vertex 5", b"vertex many"), "a number of vertices, got many"),
     "a negative number": (ply(SCENE).replace(b"vertex 5", b"vertex -5"), "expected a number of vertices, got -5"),
@@ -215,14 +206,17 @@ REFUSED = {
         ply(vertices([*SCENE_COLUMNS, "opacity"], table([*SCENE_COLUMNS, "opacity"]))),
         "expected the property opacity once, got it 2 times",
     ),
-    "points": (ply(vertices(["x", "y", "z"], table(["x", "y", "z"]))), "missing vertex properties f_dc_0, .*rot_3"),
-    "surfels": (ply(vertices(["x"], table(["x"]))), "missing vertex properties y, z"),
-    "too few harmonics": (ply(vertices([*SCENE_COLUMNS[:13], *SCENE_COLUMNS[15:]], table(range(21)))), "got 7"),
-    "harmonics with a gap": (ply(SCENE).replace(b"f_rest_8", b"f_rest_9"), "expected the property f_rest_8 once"),
-    "colours out of range": (
-        ply(vertices(SHAPE, table(SHAPE), more=TOO_BRIGHT)),
-        "expected colours from 0 to 255, got ",
+    "points": (
+        ply(vertices(["x", "y", "z"], table(["x", "y", "z"]))),
+        "missing vertex properties f_dc_0, f_dc_1, f_dc_2, opacity, scale_0, .*rot_3",
     ),
+    "surfels": (ply(vertices(["x"], table(["x"]))), "missing vertex properties y, z"),
+    "too few harmonics": (
+        ply(vertices([*SCENE_COLUMNS[:13], *SCENE_COLUMNS[15:]], table(range(21)))),
+        "0, 9, 24, 45 or 72 f_rest properties .*got 7",
+    ),
+    "harmonics with a gap": (ply(SCENE).replace(b"f_rest_8", b"f_rest_9"), "expected the property f_rest_8 once"),
+    "colours out of range": (ply(vertices(SHAPE, table(SHAPE), more=TOO_BRIGHT)), "expected colours from 0 to 255"),
 }  # fmt: skip
 
 
