@@ -4,10 +4,12 @@ import json
 import shutil
 from dataclasses import replace
 
+import commands
 import numpy as np
 import pytest
 import torch
 from capture_files import circle, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
+from commands import refused
 from train_extra import image
 
 from analytic_rasterizer import cli, io, render_stages
@@ -146,9 +148,8 @@ def test_a_scene_without_a_capture_says_what_is_needed(scene, tmp_path, capsys):
         (scene, "give --data FOLDER, and there is no options.json of `train` beside it that does"),
         (model_of(scene, tmp_path), "give --data FOLDER; "),
     ):
-        assert cli.main(["evaluate", str(given)]) == 2
-        error = capsys.readouterr().err
-        assert "does not name its capture: " + known in error and error.count("\n") == 1
+        error = refused(capsys, cli.main, ["evaluate", str(given)])
+        assert "does not name its capture: " + known in error
     assert "was trained on /data/garden" in error
 
 
@@ -156,8 +157,8 @@ def test_a_scene_beside_a_training_is_tested_as_the_training(tmp_path, capsys):
     """With the capture, the scales and the background of options.json, and the footprint of the file."""
     write_nerf_synthetic(tmp_path / "capture", circle(3), circle(2))
     out = tmp_path / "out"
-    train = ["train", str(tmp_path / "capture"), "--out", str(out), "--iterations", "2", "--random-points", "40"]
-    assert cli.main([*train, "--scales", "2", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]) == 0
+    small = "--iterations 2 --random-points 40 --scales 2 --sh-degree 0 --no-evaluate"
+    assert commands.train(tmp_path / "capture", out, small) == 0
     io.save_scene(out / "b.ply", io.load_scene(out / "scene.ply"), io.SceneMetadata(footprint="box:samples=1"))
     for given, folder, footprint in (("", out, "moment:samples=4"), ("b.ply", out / "b_evaluation", "box:samples=1")):
         assert cli.main(["evaluate", str(out / given), *QUIET]) == 0

@@ -10,9 +10,10 @@ import pytest
 import torch
 import train_extra  # noqa: F401
 from capture_files import circle, write_nerf_synthetic
+from commands import refused
 from wall import cameras, write_wall
 
-from analytic_rasterizer import cli, io, training
+from analytic_rasterizer import io, training
 from analytic_rasterizer.distributed.ranks import Ranks
 from analytic_rasterizer.training import CaptureSource, TrainingOptions, automatic, files, plan
 
@@ -32,8 +33,7 @@ def uneven(tmp_path_factory):
 
 
 def train(folder, out, *options) -> int:
-    arguments = ["train", str(folder), "--out", str(out), "--device", "cpu", "--iterations", "3", *WORDS]
-    return cli.main([*arguments, *map(str, options)])
+    return commands.train(folder, out, "--iterations 3", *WORDS, *map(str, options))
 
 
 def described(out) -> dict:
@@ -68,14 +68,14 @@ def test_a_resumed_training_does_not_look_again(uneven, tmp_path, capsys, monkey
     assert train(uneven, tmp_path, "--no-evaluate") == 0
     capsys.readouterr()
     monkeypatch.setattr(automatic, "plan_capture", None)
-    arguments = ["train", str(uneven), "--out", str(tmp_path), "--device", "cpu", "--resume", "--no-evaluate"]
-    assert cli.main([*arguments, "--iterations", "5"]) == 0
+    arguments = uneven, tmp_path, "--resume --no-evaluate"
+    assert commands.train(*arguments, "--iterations 5") == 0
     assert "--effects" not in capsys.readouterr().err
     assert described(tmp_path)["options"]["exposure"] == "affine"
     assert described(tmp_path)["source"]["taken"] == {"exposure": "affine"}
     for option, value in (("effects", "none"), ("exposure", "none")):
-        assert cli.main([*arguments, f"--{option}", value]) == 2
-        assert f"--{option}: a resumed training keeps the options" in capsys.readouterr().err
+        error = refused(capsys, commands.train, *arguments, f"--{option}", value)
+        assert f"--{option}: a resumed training keeps the options" in error
 
 
 def test_none_does_not_look(uneven, tmp_path, capsys, monkeypatch):
@@ -171,18 +171,15 @@ def test_missing_pictures_and_cameras_far_away(tmp_path, capsys):
     assert "--effects auto takes --missing skip" in lines
     assert any(line.startswith("outlying cameras yes") and "p_4.png" in line for line in lines)
     assert described(tmp_path / "out")["source"]["missing"] == "skip"
-    assert train(tmp_path / "wall", tmp_path / "refused", "--missing", "refuse") == 2
-    error = capsys.readouterr().err
-    assert "1 of 9 pictures are missing" in error and error.count("\n") == 1
+    error = refused(capsys, train, tmp_path / "wall", tmp_path / "refused", "--missing", "refuse")
+    assert "1 of 9 pictures are missing" in error
 
 
 def test_a_capture_that_cannot_be_looked_at(even, tmp_path, capsys, monkeypatch):
     """Its loader says what is wrong, if anything is."""
     shutil.copytree(even, tmp_path / "wall")
     (tmp_path / "wall" / "images" / "p_3.png").write_bytes(b"no picture")
-    assert train(tmp_path / "wall", tmp_path / "out") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and "p_3.png: unreadable" in error and error.count("\n") == 1
+    assert "p_3.png: unreadable" in refused(capsys, train, tmp_path / "wall", tmp_path / "out")
 
     def fail(*args, **options):
         raise RuntimeError("a look went wrong")

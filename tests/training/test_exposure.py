@@ -12,9 +12,10 @@ import runs
 import torch
 from capture_files import circle, draw_picture, write_nerf_synthetic
 from cli_extra import image
+from commands import refused
 from training_step import check_next_step
 
-from analytic_rasterizer import cli, training
+from analytic_rasterizer import training
 from analytic_rasterizer.training import files
 from analytic_rasterizer.training.exposure import Exposures, best_exposure, corrected
 
@@ -159,11 +160,9 @@ def test_a_resumed_training_has_the_same_bits(uneven, tmp_path):
 
 
 def test_the_command(uneven, tmp_path, capsys):
-    out = str(tmp_path / "out")
-    given = ["train", str(uneven), "--out", out, "--iterations", "3", "--device", "cpu", "--exposure", "affine"]
-    assert cli.main(given) == 0
+    out = tmp_path / "out"
+    assert commands.train(uneven, out, "--iterations 3 --exposure affine") == 0
     assert "after the best affine colour of each picture: PSNR" in capsys.readouterr().out
     assert commands.evaluate(out) == 0
     assert "PSNR, best affine colour" in capsys.readouterr().out
-    assert cli.main([*given[:-1], "curve"]) == 2
-    assert "exposure" in capsys.readouterr().err
+    assert "exposure" in refused(capsys, commands.train, uneven, out, "--iterations 3 --exposure curve")

@@ -9,9 +9,10 @@ import torch
 functional = pytest.importorskip("torchmetrics.functional.image.lpips", reason="needs the train extra")
 metric = pytest.importorskip("torchmetrics.image.lpip", reason="needs the train extra")
 
+import commands  # noqa: E402
 from capture_files import circle, write_nerf_synthetic  # noqa: E402
 
-from analytic_rasterizer import cli, training  # noqa: E402
+from analytic_rasterizer import training  # noqa: E402
 
 FILE = "vgg16-397923af.pth"
 # Of the layers of VGG-16 those after which LPIPS reads features, and the channels that they then must have.
@@ -81,11 +82,10 @@ def test_lpips_is_what_it_is_defined_as(network, like_3dgs):
 
 def test_evaluate_prints_lpips(network, tmp_path, capsys):
     write_nerf_synthetic(tmp_path / "scene", circle(3), circle(2))
-    out = str(tmp_path / "out")
-    arguments = ["--iterations", "2", "--random-points", "50", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
-    assert cli.main(["train", str(tmp_path / "scene"), "--out", out, *arguments]) == 0
+    small = "--iterations 2 --random-points 50 --sh-degree 0 --no-evaluate"
+    assert commands.train(tmp_path / "scene", tmp_path / "out", small) == 0
     capsys.readouterr()
-    assert cli.main(["evaluate", out, "--pictures", "0", "--scales", "1,2", "--device", "cpu"]) == 0
+    assert commands.command("evaluate", tmp_path / "out", "--pictures 0 --scales 1,2 --device cpu") == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     names, values = rows[3][:2], [float(value) for value in rows[3][2:]]
     assert names == ["moment:samples=4", "LPIPS"] and len(values) == 3

@@ -134,9 +134,8 @@ def test_files_of_masks(tmp_path):
     assert photographs.read_mask(tmp_path / "ones.png", 16, 12).tolist() == [[255] * 16] * 6 + [[0] * 16] * 6
     image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "none.png")
     assert (photographs.read_mask(tmp_path / "none.png", 8, 6) == 0).all()
-    with pytest.raises(
-        io.SceneError, match=r"ones.png: expected a mask of the shape of its picture, 8 x 8 px, got 8 x 6"
-    ):
+    wrong = r"ones.png: expected a mask of the shape of its picture, 8 x 8 px, got 8 x 6"
+    with pytest.raises(io.SceneError, match=wrong):
         photographs.read_mask(tmp_path / "ones.png", 8, 8)
     (tmp_path / "broken.png").write_bytes(b"nothing")
     with pytest.raises(io.SceneError, match=r"broken.png: unreadable"):
@@ -159,24 +158,19 @@ def test_alpha_may_be_a_mask(tmp_path):
         written.append((out / files.SCENE).read_bytes())
         (item, *_) = training.load_capture(folder, alpha="mask").train
         loaded = training.load_pictures([item], (1,), (1.0, 1.0, 1.0), "cpu")
-        assert (
-            loaded.mask(1, 0).unique().tolist() == [0.0, 1.0]
-            and (loaded.truth(1, 0)[:, loaded.mask(1, 0) == 0] == 0).all()
-        )
+        mask = loaded.mask(1, 0)
+        assert mask.unique().tolist() == [0.0, 1.0] and (loaded.truth(1, 0)[:, mask == 0] == 0).all()
     assert written[0] == written[1]
 
 
 def test_the_command_knows_masks(tmp_path, capsys):
-    from analytic_rasterizer import cli
-
     write_capture(tmp_path / "scene", wild)
-    given = ["train", str(tmp_path / "scene"), "--iterations", "2", "--device", "cpu", "--out"]
     said = "9 of 9 photographs have a mask, whose black pixels do not count"
-    assert cli.main([*given, str(tmp_path / "auto")]) == 0
+    assert commands.train(tmp_path / "scene", tmp_path / "auto", "--iterations 2") == 0
     assert said in capsys.readouterr().err
     assert commands.evaluate(tmp_path / "auto") == 0
     assert said in capsys.readouterr().err
-    assert cli.main([*given, str(tmp_path / "none"), "--masks", "none"]) == 0
+    assert commands.train(tmp_path / "scene", tmp_path / "none", "--iterations 2 --masks none") == 0
     assert said not in capsys.readouterr().err
     source = json.loads((tmp_path / "none" / "options.json").read_text())["source"]
     assert source["masks"] == "none" and source["alpha"] == "background"

@@ -7,15 +7,17 @@ import threading
 from contextlib import nullcontext
 from types import SimpleNamespace
 
+import commands
 import numpy as np
 import pytest
 import runs
 import torch
 from capture_files import circle, write_nerf_synthetic
+from commands import refused
 from marks import needs_cuda
 from train_extra import image
 
-from analytic_rasterizer import cli, io, training
+from analytic_rasterizer import io, training
 from analytic_rasterizer.analysis import memory as system
 from analytic_rasterizer.training import PictureMemory, TrainingOptions, photographs, pictures, schedule, store
 from analytic_rasterizer.training.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store
@@ -364,21 +366,18 @@ def test_what_does_not_fit_is_said_before_anything_is_decoded(synthetic, monkeyp
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["--picture-memory-gpu", "1"], "picture_memory_gpu must be None on a CPU, got 1.0"),
-        (["--picture-memory-host", "-1"], "picture_memory_host must be finite and not negative, got -1.0"),
+        ("--picture-memory-gpu 1", "picture_memory_gpu must be None on a CPU, got 1.0"),
+        ("--picture-memory-host -1", "picture_memory_host must be finite and not negative, got -1.0"),
     ],
 )
 def test_bad_options(synthetic, tmp_path, unread, capsys, options, message):
-    command = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu", *options]
-    assert cli.main(command) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, commands.train, synthetic, tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 
 
 def test_the_command_says_where_pictures_are(synthetic, tmp_path, capsys):
-    common = ["train", str(synthetic), "--device", "cpu", "--iterations", "3", "--no-evaluate"]
     for out, options in (("file", ["--picture-memory-host", "0"]), ("device", [])):
-        assert cli.main([*common, "--out", str(tmp_path / out), *options]) == 0
+        assert commands.train(synthetic, tmp_path / out, "--iterations 3 --no-evaluate", *options) == 0
         said = "in memory (--picture-memory-host), and 1.72e-05 GiB are decoded ahead" in capsys.readouterr().err
         assert said == (out == "file")
     scenes = [io.load_scene(tmp_path / out / "scene.ply") for out in ("file", "device")]

@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 from capture_files import circle, write_colmap, write_nerf_synthetic, write_pictures
+from commands import refused, words_of
 from places import ROOT
 from processes import run_python
 from train_extra import image
@@ -184,14 +185,8 @@ def test_a_table_is_trained_tested_and_written(blender, tmp_path):
     said = []
     rows = ["analytic", "3dgs-ss", "moment"]
     results = run_table(TABLES["blender-mtmt"], blender, tmp_path, rows=rows, say=said.append, **TINY)
-    assert [line for line in said if line.startswith("[")] == [
-        "[1/6] 3dgs-ss, chair",
-        "[2/6] 3dgs-ss, lego",
-        "[3/6] analytic, chair",
-        "[4/6] analytic, lego",
-        "[5/6] moment, chair",
-        "[6/6] moment, lego",
-    ]
+    names = [f"{row}, {scene}" for row in ("3dgs-ss", "analytic", "moment") for scene in ("chair", "lego")]
+    assert [line for line in said if line.startswith("[")] == [f"[{k}/6] {name}" for k, name in enumerate(names, 1)]
     assert "skipped: drums is not there (nor in multiscale, nerf_synthetic)" in said
     # The test is `evaluate` on the pictures of the scene, with the options of the row.
     for row, options in (("3dgs-ss", {"footprint": "point", "supersampling": 2}), ("moment", {"footprint": "moment"})):
@@ -315,14 +310,12 @@ def test_mip_nerf_360_takes_the_folders_of_the_paper(photographs, tmp_path):
     single = run("360-stst", photographs, tmp_path, rows=rows)
     multi = run("360-mtmt", photographs, tmp_path, rows=["analytic"])
     larger = run("360-super-resolution", photographs, tmp_path, rows=["analytic"])
-    cases = [
-        (single, "analytic", "360-single", "images_2", (1,), "box"),
-        (single, "analytic-bicubic", "360-single", "images", (2,), "bicubic"),
-        (multi, "analytic", "360-multi", "images_2", (1, 2, 4, 8), "bicubic"),
-        (larger, "analytic", "360-multi", "images", (1,), "box"),
-    ]
-    sizes = [[24, 16], [24, 16], [24, 16], [48, 32]]
-    for (results, row, folder, images, scales, downsampling), size in zip(cases, sizes):
+    for results, row, folder, images, scales, downsampling, size in (
+        (single, "analytic", "360-single", "images_2", (1,), "box", [24, 16]),
+        (single, "analytic-bicubic", "360-single", "images", (2,), "bicubic", [24, 16]),
+        (multi, "analytic", "360-multi", "images_2", (1, 2, 4, 8), "bicubic", [24, 16]),
+        (larger, "analytic", "360-multi", "images", (1,), "box", [48, 32]),
+    ):
         place = photographs / "360_v2" / "bonsai"
         test = training.load_capture(place, images).test
         assert len(test) == 2
@@ -335,10 +328,8 @@ def test_mip_nerf_360_takes_the_folders_of_the_paper(photographs, tmp_path):
     assert described["source"]["images"] == "images" and described["options"]["downsampling"] == "bicubic"
     assert "flowers has no folder images_4" in single.skipped and "stump is not there" in single.skipped[3]
     # The starred row of flowers needs no reduced pictures.
-    assert set(single.tests["analytic"]) == {"bonsai"} and set(single.tests["analytic-bicubic"]) == {
-        "bonsai",
-        "flowers",
-    }
+    assert set(single.tests["analytic"]) == {"bonsai"}
+    assert set(single.tests["analytic-bicubic"]) == {"bonsai", "flowers"}
     rows = block(text(single), "SSIM")
     assert rows[""] == ["flowers", "bonsai", "mean"] and rows["analytic"][0] == rows["analytic"][2] == "-"
     assert rows["paper: Ours*"][1] == "0.943?" and rows["paper: Ours"][1] == "0.943"
@@ -407,22 +398,17 @@ def test_a_broken_scene_is_found_before_any_is_trained(blender, tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["blender-stst"], "blender-stst needs --data FOLDER and --out DIR"),
-        (["blender"], "argument NAME: invalid choice: 'blender'"),
-        (["blender-stst", "--scenes", "room"], "scenes must be among chair, drums,"),
-        (["blender-stst", "--rows", "ours"], "rows must be among 3dgs, 3dgs-ss,"),
-        (["blender-stst", "--scenes", "ship"], "nothing of blender-stst is there: ship is not there"),
-        (["blender-stst", "--iterations", "0"], "must be a positive whole number, got 0"),
+        ("blender-stst", "blender-stst needs --data FOLDER and --out DIR"),
+        ("blender", "argument NAME: invalid choice: 'blender'"),
+        ("blender-stst --scenes room", "scenes must be among chair, drums,"),
+        ("blender-stst --rows ours", "rows must be among 3dgs, 3dgs-ss,"),
+        ("blender-stst --scenes ship", "nothing of blender-stst is there: ship is not there"),
+        ("blender-stst --iterations 0", "must be a positive whole number, got 0"),
     ],
 )
 def test_errors_are_one_line(blender, tmp_path, capsys, arguments, message):
-    folders = ["--data", str(blender), "--out", str(tmp_path / "out"), "--no-lpips"] if len(arguments) > 1 else []
-    try:
-        code = paper_tables.main([*arguments, *folders])
-    except SystemExit as stop:
-        code = stop.code
-    error = capsys.readouterr().err
-    assert code == 2 and message in error and error.startswith("error: ") and error.count("\n") == 1
+    folders = ["--data", blender, "--out", tmp_path / "out", "--no-lpips"] if " " in arguments else []
+    assert message in refused(capsys, paper_tables.main, words_of(arguments, *folders))
     assert not (tmp_path / "out").exists()
 
 
@@ -443,9 +429,9 @@ def test_the_program_lists_the_tables():
 
 def test_the_program_prints_the_table_and_measures_lpips_as_the_paper_did(blender, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    arguments = ["--data", str(blender), "--out", str(tmp_path / "out"), "--scenes", "lego", "--rows", "box"]
-    arguments += ["--iterations", "1", "--preset", "quick", "--seed", "4", "--device", "cpu"]
-    assert paper_tables.main(["blender-stst", *arguments]) == 0
+    quick = "--scenes lego --rows box --iterations 1 --preset quick --seed 4 --device cpu"
+    arguments = words_of("blender-stst --data", blender, "--out", tmp_path / "out", quick)
+    assert paper_tables.main(arguments) == 0
     captured = capsys.readouterr()
     assert "LPIPS is left out: " in captured.err and "vgg16-397923af.pth" in captured.err
     assert "[1/1] box, lego" in captured.err
@@ -463,6 +449,6 @@ def test_the_program_prints_the_table_and_measures_lpips_as_the_paper_did(blende
 
     monkeypatch.setattr("paper_tables.load_lpips", load_lpips)
     monkeypatch.setattr(training.Trainer, "step", lambda trainer: pytest.fail("trains"))
-    assert paper_tables.main(["blender-stst", *arguments]) == 0
+    assert paper_tables.main(arguments) == 0
     assert asked == [(("vgg", "cpu"), {"like_3dgs": True})]
     assert "\nLPIPS\n" in capsys.readouterr().out

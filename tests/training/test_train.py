@@ -18,8 +18,10 @@ import pytest
 import runs
 import torch
 from capture_files import circle, looking_at_origin, truth_gaussians, write_nerf_synthetic
+from commands import refused
 from marks import needs_cuda
 from places import ROOT
+from ply_files import ply, vertices
 from processes import DEADLINE
 from runs import rows_shown, scatter
 from train_extra import image
@@ -63,6 +65,20 @@ def nan_picture(folder) -> None:
     image.fromarray(pixels).save(folder / "train" / "r_4.png", format="TIFF")
 
 
+def of_picture(change):
+    """A change of the bytes of one picture."""
+
+    def write(folder):
+        path = folder / "train" / "r_1.png"
+        path.write_bytes(change(path.read_bytes()))
+
+    return write
+
+
+def of_transforms(change):
+    return lambda folder: change_transforms(folder, change)
+
+
 BROKEN = {
     "no folder": (lambda f: f.rename(f.with_name("elsewhere")), "no such folder"),
     "nothing in it": (
@@ -74,28 +90,22 @@ BROKEN = {
         r"2 of 13 pictures are missing, the first is .*r_2",
     ),
     "nan": (nan_picture, r"r_4.png: pixels must be finite, got nan at x 7, y 3"),
-    "cut short": (
-        lambda f: (f / "train" / "r_1.png").write_bytes((f / "train" / "r_1.png").read_bytes()[:200]),
-        "r_1.png: unreadable or cut short",
-    ),
+    "cut short": (of_picture(lambda content: content[:200]), "r_1.png: unreadable or cut short"),
     "too large for Pillow": (
-        lambda f: (f / "train" / "r_1.png").write_bytes(png_of_size(20000, 10000)),
+        of_picture(lambda content: png_of_size(20000, 10000)),
         r"r_1.png: unreadable or cut short \(Image size \(200000000 pixels\) exceeds limit",
     ),
-    "broken header": (
-        lambda f: (f / "train" / "r_1.png").write_bytes(b"P6 3x2 255\n"),
-        "r_1.png: unreadable or cut short",
-    ),
+    "broken header": (of_picture(lambda content: b"P6 3x2 255\n"), "r_1.png: unreadable or cut short"),
     "one camera": (
-        lambda f: change_transforms(f, lambda c: c.update(frames=c["frames"][:1])),
+        of_transforms(lambda c: c.update(frames=c["frames"][:1])),
         "training needs at least 2 pictures, got 1",
     ),
     "one place": (
-        lambda f: change_transforms(f, lambda c: c.update(frames=[c["frames"][0]] * 3)),
+        of_transforms(lambda c: c.update(frames=[c["frames"][0]] * 3)),
         "cameras at different places, got all 3 at one",
     ),
     "bad pose": (
-        lambda f: change_transforms(f, lambda c: c["frames"][1].update(transform_matrix=[[math.nan] * 4] * 4)),
+        of_transforms(lambda c: c["frames"][1].update(transform_matrix=[[math.nan] * 4] * 4)),
         "frame 1: transform_matrix must hold 4 x 4 finite numbers",
     ),
 }
@@ -107,62 +117,51 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
     shutil.copytree(synthetic, folder)
     breaks, message = BROKEN[case]
     breaks(folder)
-    options = ["--device", "cpu", "--missing", "refuse", "--iterations", "1"]
-    assert cli.main(["train", str(folder), "--out", str(tmp_path / "out"), *options]) == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error) and error.startswith("error: ") and error.count("\n") == 1
+    error = refused(capsys, commands.train, folder, tmp_path / "out", "--missing refuse --iterations 1")
+    assert re.search(message, error)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     "extra, message",
     [
-        (["--footprint", "bx"], "footprint must be one of"),
-        (["--footprint", "box:samples=3"], "samples must be one of"),
-        (["--iterations", "0"], "iterations must be at least 1, got 0"),
-        (["--seconds", "nan"], "seconds must be finite and not negative, got nan"),
-        (["--scales", "1,0"], "scales must be whole numbers of at least 1, got (1, 0)"),
-        (["--scales", "1,1"], "scales must be different from each other"),
-        (["--scales", "1,2", "--scale-repeats", "1"], "scale_repeats must be 2 numbers"),
-        (["--scales", "one"], "must be whole numbers with commas between them, got one"),
-        (["--scales", "64", "--effects", "none"], "32 x 32 px are too few for these scales"),
-        (["--density", "more"], "density must be one of 3dgs, absgrad, mcmc, none, got more"),
+        ("--footprint bx", "footprint must be one of"),
+        ("--footprint box:samples=3", "samples must be one of"),
+        ("--iterations 0", "iterations must be at least 1, got 0"),
+        ("--seconds nan", "seconds must be finite and not negative, got nan"),
+        ("--scales 1,0", "scales must be whole numbers of at least 1, got (1, 0)"),
+        ("--scales 1,1", "scales must be different from each other"),
+        ("--scales 1,2 --scale-repeats 1", "scale_repeats must be 2 numbers"),
+        ("--scales one", "must be whole numbers with commas between them, got one"),
+        ("--scales 64 --effects none", "32 x 32 px are too few for these scales"),
+        ("--density more", "density must be one of 3dgs, absgrad, mcmc, none, got more"),
+        ("--densify-until 1.5", "densify_until must be 0 to 1, got 1.5 (a share of the training; above 1 it is a "),
+        ("--densify-from -2", "densify_from must be 0 to 1, got -2"),
+        ("--rates-from nan", "rates_from must be 0 to 1, got nan"),
+        ("--sh-degree 4", "sh_degree must be 0 to 3, got 4"),
+        ("--background green", "background must be one of black, white, random, got green"),
+        ("--preset quick --opacity-rate 0", "opacity_rate must be positive and finite, got 0.0"),
+        ("--density mcmc --max-gaussians 0", 'max_gaussians must be at least 1 with density "mcmc"'),
+        ("--seed 99999999999999", "seed must be -2^39 to 2^40 - 1, got 99999999999999"),
+        ("--random-points -1", "random_points must be at least 0, got -1"),
         (
-            ["--densify-until", "1.5"],
-            "densify_until must be 0 to 1, got 1.5 (a share of the training; above 1 it is a ",
-        ),
-        (["--densify-from", "-2"], "densify_from must be 0 to 1, got -2"),
-        (["--rates-from", "nan"], "rates_from must be 0 to 1, got nan"),
-        (["--sh-degree", "4"], "sh_degree must be 0 to 3, got 4"),
-        (["--background", "green"], "background must be one of black, white, random, got green"),
-        (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
-        (["--density", "mcmc", "--max-gaussians", "0"], 'max_gaussians must be at least 1 with density "mcmc"'),
-        (["--seed", "99999999999999"], "seed must be -2^39 to 2^40 - 1, got 99999999999999"),
-        (["--random-points", "-1"], "random_points must be at least 0, got -1"),
-        (
-            ["--random-points", "500", "--max-gaussians", "300", "--density", "mcmc"],
+            "--random-points 500 --max-gaussians 300 --density mcmc",
             "random_points must be at most max_gaussians, 300, got 500",
         ),
-        (["--max-gaussians", "1"], "training needs at least 2 points to start from, got 1"),
-        (["--preset", "slow"], "argument --preset: invalid choice: 'slow'"),
-        (["--port", "8000"], "--port is for --watch"),
-        (["--watch", "--port", "65536"], "must be a port from 0 to 65535, got 65536"),
-        (["--export", "mip", "--footprint", "point"], "--export mip is for footprints that integrate over pixels"),
-        (["--save-every", "-1"], "save_every must be at least 0, got -1"),
-        (["--seconds", "5", "--iterations", "10"], "--seconds is instead of --iterations: leave out one of them"),
-        (["--test-every", "1"], "test_every must be 0 or at least 2, got 1"),
-        (["--resume"], "checkpoint.pt: no such file; there is no training to resume"),
-        (["--points", "none.ply"], "none.ply"),
+        ("--max-gaussians 1", "training needs at least 2 points to start from, got 1"),
+        ("--preset slow", "argument --preset: invalid choice: 'slow'"),
+        ("--port 8000", "--port is for --watch"),
+        ("--watch --port 65536", "must be a port from 0 to 65535, got 65536"),
+        ("--export mip --footprint point", "--export mip is for footprints that integrate over pixels"),
+        ("--save-every -1", "save_every must be at least 0, got -1"),
+        ("--seconds 5 --iterations 10", "--seconds is instead of --iterations: leave out one of them"),
+        ("--test-every 1", "test_every must be 0 or at least 2, got 1"),
+        ("--resume", "checkpoint.pt: no such file; there is no training to resume"),
+        ("--points none.ply", "none.ply"),
     ],
 )
 def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message):
-    try:
-        code = cli.main(["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu", *extra])
-    except SystemExit as stop:
-        code = stop.code
-    error = capsys.readouterr().err
-    assert code == 2 and message in error
-    assert error.startswith("error: ") and error.count("\n") == 1
+    assert message in refused(capsys, commands.train, synthetic, tmp_path / "out", extra)
     assert not (tmp_path / "out").exists()
 
 
@@ -323,19 +322,18 @@ def test_a_step_renders_supersampled_pictures(device, synthetic, tmp_path):
 
 
 def test_evaluate_supersamples_as_the_training_did(synthetic, tmp_path, capsys):
-    arguments = ["--iterations", "3", "--random-points", "60", "--sh-degree", "0", "--device", "cpu"]
-    arguments += ["--footprint", "point", "--supersampling", "4", "--scales", "4"]  # coarse pixels: it matters
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), *arguments]) == 0
+    coarse = "--footprint point --supersampling 4 --scales 4"  # pixels so large that it matters
+    assert commands.train(synthetic, tmp_path, "--iterations 3 --random-points 60 --sh-degree 0", coarse) == 0
     expected = json.loads((tmp_path / files.METRICS).read_text())["test"]["mean"]["psnr"]
     measured = []
-    for extra in ([], ["--supersampling", "4"], ["--supersampling", "1"]):
-        assert cli.main(["evaluate", str(tmp_path), "--lpips", "none", "--pictures", "0", *extra]) == 0
+    for extra in ([], ["--supersampling 4"], ["--supersampling 1"]):
+        assert commands.evaluate(tmp_path, *extra) == 0
         results = json.loads((tmp_path / "evaluation.json").read_text())
         measured.append(results["results"]["point:dilation=0.3"]["mean"]["psnr"])
     assert measured[0] == measured[1] == pytest.approx(expected, abs=1e-2)  # the .ply rounds a little
     assert abs(measured[2] - expected) > 0.05
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "no"), "--supersampling", "0"]) == 2
-    assert "supersampling must be at least 1, got 0" in capsys.readouterr().err
+    error = refused(capsys, commands.train, synthetic, tmp_path / "no", "--supersampling 0")
+    assert "supersampling must be at least 1, got 0" in error
 
 
 def cpu_test_pictures(folder):
@@ -420,11 +418,10 @@ def test_a_deterministic_step_leaves_the_mode_of_the_program(synthetic, tmp_path
 
 
 def test_the_command_takes_deterministic(synthetic, tmp_path, capsys):
-    arguments = ["train", str(synthetic), "--out", str(tmp_path), "--deterministic", "--device", "cpu"]
-    assert cli.main([*arguments, "--seconds", "5"]) == 2
-    assert "--deterministic has no effect: by the clock, every run has another number" in capsys.readouterr().err
-    small = ["--iterations", "3", "--random-points", "50", "--no-evaluate"]
-    assert cli.main([*arguments, *small]) == 0
+    error = refused(capsys, commands.train, synthetic, tmp_path, "--deterministic --seconds 5")
+    assert "--deterministic has no effect: by the clock, every run has another number" in error
+    small = "--iterations 3 --random-points 50 --no-evaluate"
+    assert commands.train(synthetic, tmp_path, "--deterministic", small) == 0
     assert json.loads((tmp_path / files.OPTIONS).read_text())["options"]["deterministic"] is True
 
 
@@ -615,9 +612,8 @@ def test_errors_of_picture_gradients(changed, error, message):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsys, monkeypatch, number):
     """The step that runs is completed; the end is the same as without the interruption."""
-    arguments = ["train", str(synthetic), "--device", "cpu", "--iterations", "60", "--random-points", "50"]
-    arguments += ["--sh-degree", "0", "--scales", "1"]
-    assert cli.main([*arguments, "--out", str(tmp_path / "whole")]) == 0
+    whole, part, small = tmp_path / "whole", tmp_path / "part", "--iterations 60 --random-points 50 --sh-degree 0"
+    assert commands.train(synthetic, whole, small) == 0
     step = training.Trainer.step
 
     def interrupted(trainer):
@@ -627,53 +623,45 @@ def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsy
 
     monkeypatch.setattr(training.Trainer, "step", interrupted)
     before = signal.getsignal(number)
-    assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 130
+    assert commands.train(synthetic, part, small) == 130
     assert signal.getsignal(number) is before
     assert "stopped after 34 steps and saved; go on with --resume" in capsys.readouterr().out
-    assert (tmp_path / "part" / files.SCENE).exists()
+    assert (part / files.SCENE).exists()
     monkeypatch.undo()
-    assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 2
-    assert "go on with --resume" in capsys.readouterr().err
-    assert cli.main([*arguments, "--seed", "3", "--resume", "--out", str(tmp_path / "part")]) == 2
-    assert "--seed: a resumed training keeps the options of its checkpoint" in capsys.readouterr().err
-    assert cli.main([*arguments, "--resume", "--out", str(tmp_path / "part")]) == 0
-    assert (tmp_path / "whole" / files.SCENE).read_bytes() == (tmp_path / "part" / files.SCENE).read_bytes()
+    assert "go on with --resume" in refused(capsys, commands.train, synthetic, part, small)
+    error = refused(capsys, commands.train, synthetic, part, small, "--seed 3 --resume")
+    assert "--seed: a resumed training keeps the options of its checkpoint" in error
+    assert commands.train(synthetic, part, small, "--resume") == 0
+    assert (whole / files.SCENE).read_bytes() == (part / files.SCENE).read_bytes()
+
+
+def signal_after_steps(run, monkeypatch, number, then=lambda: None) -> None:
+    step = run.trainer.step
+
+    def signalled():
+        step()
+        signal.raise_signal(number)
+        then()
+
+    monkeypatch.setattr(run.trainer, "step", signalled)
 
 
 def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
     run = make_run(synthetic, tmp_path)
-
-    def interrupted():
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(run.trainer, "step", interrupted)
+    signal_after_steps(run, monkeypatch, signal.SIGINT, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         run.train()
 
 
 def test_a_second_sigterm_kills(synthetic, tmp_path, monkeypatch):
-    run = make_run(synthetic, tmp_path, iterations=3)
-    step, handlers = run.trainer.step, []
-
-    def interrupted():
-        step()
-        signal.raise_signal(signal.SIGTERM)
-        handlers.append(signal.getsignal(signal.SIGTERM))
-
-    monkeypatch.setattr(run.trainer, "step", interrupted)
+    run, handlers = make_run(synthetic, tmp_path, iterations=3), []
+    signal_after_steps(run, monkeypatch, signal.SIGTERM, lambda: handlers.append(signal.getsignal(signal.SIGTERM)))
     assert not run.train() and handlers == [signal.SIG_DFL]
 
 
 def test_a_handler_of_the_program_for_sigterm_stays(synthetic, tmp_path, monkeypatch):
     run, received = make_run(synthetic, tmp_path, iterations=3), []
-    step = run.trainer.step
-
-    def signalled():
-        step()
-        signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr(run.trainer, "step", signalled)
+    signal_after_steps(run, monkeypatch, signal.SIGTERM)
     before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
     try:
         assert run.train() and len(received) == 3
@@ -734,9 +722,7 @@ def test_a_loss_that_is_not_finite_ends_with_an_error(synthetic, tmp_path, capsy
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04K\x01."])
 def test_a_broken_checkpoint_is_one_line(synthetic, tmp_path, capsys, content):
     (tmp_path / files.CHECKPOINT).write_bytes(content)
-    assert commands.train(synthetic, tmp_path, "--resume") == 2
-    error = capsys.readouterr().err
-    assert "checkpoint.pt: " in error and error.startswith("error: ") and error.count("\n") == 1
+    assert "checkpoint.pt: " in refused(capsys, commands.train, synthetic, tmp_path, "--resume")
 
 
 def test_a_checkpoint_of_an_earlier_format(tmp_path):
@@ -775,7 +761,7 @@ def test_steps_do_not_wait_for_the_device(synthetic, tmp_path, kind, sparse):
 # ------------------------------------------------------------------------------------- watching
 
 
-def watched(arguments, monkeypatch) -> list[tuple]:
+def watched(monkeypatch, *given) -> list[tuple]:
     """Runs the command with a viewer that wants every scene; returns what it was shown: (scene, step, text, force)."""
     pytest.importorskip("viser", reason="needs the view extra")
     from analytic_rasterizer.viewer import LiveViewer
@@ -787,15 +773,15 @@ def watched(arguments, monkeypatch) -> list[tuple]:
         return update(viewer, scene, step=step, text=text, force=force)
 
     monkeypatch.setattr(LiveViewer, "update", note)
-    assert cli.main([*arguments, "--watch"]) == 0
+    assert commands.train(*given, "--watch") == 0
     return shown
 
 
 def test_watching_shows_the_scene_and_changes_no_bit(synthetic, tmp_path, monkeypatch, capsys, device):
-    common = ["--device", device, "--iterations", "12", "--random-points", "60", "--sh-degree", "0", "--no-evaluate"]
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "alone"), *common]) == 0
+    common = f"--device {device} --iterations 12 --random-points 60 --sh-degree 0 --no-evaluate"
+    assert commands.train(synthetic, tmp_path / "alone", common) == 0
     capsys.readouterr()
-    shown = watched(["train", str(synthetic), "--out", str(tmp_path / "watched"), *common], monkeypatch)
+    shown = watched(monkeypatch, synthetic, tmp_path / "watched", common)
     assert re.search(r"^watch at http://127\.0\.0\.1:\d+/[\w-]+/$", capsys.readouterr().out, re.M)
     assert [step for _, step, *_ in shown] == list(range(13))
     assert [force for *_, force in shown] == [False] * 12 + [True]
@@ -816,8 +802,8 @@ def test_a_viewer_starts_with_what_is_trained(synthetic, tmp_path):
 
 def test_watching_without_viser_names_the_extra(synthetic, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "out"), "--watch"]) == 2
-    assert "needs viser: pip install analytic_rasterizer[view]" in capsys.readouterr().err
+    error = refused(capsys, commands.train, synthetic, tmp_path / "out", "--watch")
+    assert "needs viser: pip install analytic_rasterizer[view]" in error
     assert not (tmp_path / "out").exists()
 
 
@@ -828,8 +814,7 @@ def test_watching_without_viser_names_the_extra(synthetic, tmp_path, monkeypatch
 def trained(synthetic, tmp_path_factory):
     """A folder of results."""
     out = tmp_path_factory.mktemp("trained")
-    arguments = ["train", str(synthetic), "--out", str(out), "--device", "cpu", "--iterations", "40"]
-    assert cli.main([*arguments, "--random-points", "80", "--sh-degree", "1", "--scales", "1,2"]) == 0
+    assert commands.train(synthetic, out, "--iterations 40 --random-points 80 --sh-degree 1 --scales 1,2") == 0
     return out
 
 
@@ -853,9 +838,8 @@ def test_the_ply_says_how_pixels_were_integrated(tmp_path, footprint, integrated
 
 @pytest.mark.parametrize("filter_3d", [False, True])
 def test_the_exported_scene_has_the_pixel_in_it(synthetic, tmp_path, capsys, device, filter_3d):
-    arguments = ["--iterations", "3", "--random-points", "60", "--sh-degree", "1", "--no-evaluate", "--scales", "2,1"]
-    arguments += ["--device", device, "--export", "mip"] + ["--filter-3d"] * filter_3d
-    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), *arguments]) == 0
+    small = f"--device {device} --iterations 3 --random-points 60 --sh-degree 1 --no-evaluate --scales 2,1"
+    assert commands.train(synthetic, tmp_path, small, "--export mip", *["--filter-3d"] * filter_3d) == 0
     assert f"{tmp_path / files.MIP_SCENE}: for viewers" in capsys.readouterr().out
     said = [io.read_metadata(tmp_path / name) for name in (files.SCENE, files.MIP_SCENE)]
     assert [found.footprint for found in said] == ["moment:samples=4", "point:dilation=0.0"]
@@ -906,37 +890,34 @@ def test_number_of_random_points():
 
 @pytest.mark.parametrize("given", [False, True], ids=["of the capture", "given"])
 def test_of_more_points_than_the_limit_some_are_drawn(capture, tmp_path, capsys, given):
-    arguments = ["train", str(capture), "--images", "photographs", "--device", "cpu", "--iterations", "1"]
-    arguments += ["--sh-degree", "0", "--no-evaluate", "--means-rate", "1e-30", "--means-rate-end", "1e-30"]
+    fixed = ["--images photographs --iterations 1 --sh-degree 0 --no-evaluate"]
+    fixed += ["--means-rate 1e-30 --means-rate-end 1e-30"]
     points, _ = training.random_points(60, seed=5)
     if given:
         points = points + 1
-        header = "ply\nformat ascii 1.0\nelement vertex 60\n" + "".join(f"property double {a}\n" for a in "xyz")
-        rows = "".join(" ".join(map(repr, row)) + "\n" for row in points.tolist())
-        (tmp_path / "p.ply").write_text(f"{header}end_header\n{rows}")
-        arguments += ["--points", str(tmp_path / "p.ply")]
+        (tmp_path / "p.ply").write_bytes(ply(vertices("xyz", points, "double"), layout="ascii"))
+        fixed += ["--points", tmp_path / "p.ply"]
 
     def start(name, *extra):
-        assert cli.main([*arguments, "--out", str(tmp_path / name), *extra]) == 0
+        assert commands.train(capture, tmp_path / name, *fixed, *extra) == 0
         state = files.read_checkpoint(tmp_path / name / files.CHECKPOINT)
         return state["gaussians"]["means"], "drawn at random" in capsys.readouterr().err
 
-    everything, said = start("60", "--max-gaussians", "60")
+    everything, said = start("60", "--max-gaussians 60")
     assert torch.equal(everything, points) and not said
-    some, said = start("40", "--max-gaussians", "40")
+    some, said = start("40", "--max-gaussians 40")
     assert len(some) == 40 and said
     places = [torch.where((points == row).all(1))[0].item() for row in some]
     assert places == sorted(set(places)) and places != list(range(40))
-    assert torch.equal(start("again", "--max-gaussians", "40")[0], some)
-    assert not torch.equal(start("seed", "--max-gaussians", "40", "--seed", "1")[0], some)
+    assert torch.equal(start("again", "--max-gaussians 40")[0], some)
+    assert not torch.equal(start("seed", "--max-gaussians 40 --seed 1")[0], some)
 
 
 def test_a_scene_of_more_gaussians_than_the_limit_is_refused(synthetic, trained, tmp_path, capsys):
-    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu", "--max-gaussians", "30"]
     count, path = len(io.load_scene(trained / files.SCENE).means), trained / files.SCENE
-    assert cli.main([*arguments, "--points", str(path)]) == 2
-    expected = f"error: max_gaussians must be at least {count}, the Gaussians of {path}, or 0, got 30\n"
-    assert capsys.readouterr().err == expected and not (tmp_path / "out").exists()
+    error = refused(capsys, commands.train, synthetic, tmp_path / "out", "--max-gaussians 30 --points", path)
+    assert error == f"error: max_gaussians must be at least {count}, the Gaussians of {path}, or 0, got 30\n"
+    assert not (tmp_path / "out").exists()
 
 
 def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
@@ -951,14 +932,12 @@ def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
 def test_training_does_not_start_from_a_scene_without_gaussians(synthetic, trained, tmp_path, capsys):
     scene = io.load_scene(trained / files.SCENE)
     io.save_scene(tmp_path / "none.ply", scene.rows(slice(0)))
-    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu"]
-    assert cli.main([*arguments, "--points", str(tmp_path / "none.ply")]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path / 'none.ply'}: the scene has no Gaussians\n"
+    error = refused(capsys, commands.train, synthetic, tmp_path / "out", "--points", tmp_path / "none.ply")
+    assert error == f"error: {tmp_path / 'none.ply'}: the scene has no Gaussians\n"
 
 
 def test_evaluate_compares_footprints(trained, capsys):
-    arguments = ["evaluate", str(trained), "--footprint", "box:samples=4", "point", "--scales", "1,2,4"]
-    assert cli.main([*arguments, "--lpips", "none", "--pictures", "1"]) == 0
+    assert commands.evaluate(trained, "--footprint box:samples=4 point --scales 1,2,4 --pictures 1") == 0
     table = capsys.readouterr().out.splitlines()
     assert table[0].split() == ["footprint", "1/1", "1/2", "1/4", "mean"]
     footprints, measures = ("box:samples=4", "point:dilation=0.3"), ("PSNR", "SSIM", "PSNR,")
@@ -986,8 +965,8 @@ def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
     write_nerf_synthetic(tmp_path / "scene", seen, empty)
     (tmp_path / "scene" / "test" / "seen.png").unlink()
     shutil.copy(tmp_path / "scene" / "train" / "r_0.png", tmp_path / "scene" / "test" / "seen.png")
-    arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]
-    assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--random-points", "50"]) == 0
+    small = "--iterations 1 --sh-degree 0 --random-points 50"
+    assert commands.train(tmp_path / "scene", tmp_path / "out", small) == 0
     assert commands.evaluate(tmp_path / "out") == 0
     metrics = json.loads((tmp_path / "out" / files.METRICS).read_text(), parse_constant=refuse_constant)
     evaluation = (tmp_path / "out" / "evaluation.json").read_text()
@@ -1004,8 +983,7 @@ def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
 @pytest.mark.parametrize("scales, got", [("1,0", "(1, 0)"), ("-1", "(-1,)")])
 def test_evaluate_refuses_scales_that_are_none(trained, capsys, scales, got):
     message = f"scales must be whole numbers of at least 1, got {got}"
-    assert cli.main(["evaluate", str(trained), f"--scales={scales}"]) == 2
-    assert capsys.readouterr().err == f"error: {message}\n"
+    assert refused(capsys, commands.evaluate, trained, f"--scales={scales}") == f"error: {message}\n"
     with pytest.raises(ValueError, match=re.escape(message)):
         training.load_pictures([], tuple(map(int, scales.split(","))), captures.WHITE, "cpu")
     with pytest.raises(ValueError, match=re.escape("got (1.5,)")):
@@ -1028,26 +1006,27 @@ def test_evaluate_says_how_to_get_the_weights_of_lpips(trained, capsys, monkeypa
 def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys, content):
     if content is not None:
         (tmp_path / files.OPTIONS).write_text(content)
-    assert cli.main(["evaluate", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and "options.json" in error and error.count("\n") == 1
+    assert "options.json" in refused(capsys, commands.evaluate, tmp_path)
 
 
 def test_evaluate_finds_the_capture_from_another_folder(synthetic, tmp_path, capsys, monkeypatch):
     shutil.copytree(synthetic, tmp_path / "scene")
     monkeypatch.chdir(tmp_path)
-    small = ["--iterations", "2", "--random-points", "50", "--no-evaluate", "--device", "cpu"]
-    assert cli.main(["train", "scene", "--out", "out", *small]) == 0
+    assert commands.train("scene", "out", "--iterations 2 --random-points 50 --no-evaluate") == 0
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    evaluate = ["evaluate", str(tmp_path / "out"), "--lpips", "none", "--device", "cpu"]
-    assert cli.main(evaluate) == 0
+    assert commands.evaluate(tmp_path / "out", "--device cpu") == 0
     # Another capture is named where it is the one without test pictures.
-    shutil.copytree(synthetic, tmp_path / "untested")
-    (tmp_path / "untested" / "transforms_test.json").unlink()
-    capsys.readouterr()
-    assert cli.main([*evaluate, "--data", "../untested"]) == 2
-    assert capsys.readouterr().err == "error: ../untested: there are no test pictures\n"
+    untested(synthetic, tmp_path / "untested")
+    error = refused(capsys, commands.evaluate, tmp_path / "out", "--device cpu --data ../untested")
+    assert error == "error: ../untested: there are no test pictures\n"
+
+
+def untested(synthetic, folder):
+    """The capture without test pictures."""
+    shutil.copytree(synthetic, folder)
+    (folder / "transforms_test.json").unlink()
+    return folder
 
 
 def test_example_trains(synthetic, tmp_path):
@@ -1063,9 +1042,7 @@ def test_example_trains(synthetic, tmp_path):
     done = run(synthetic)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("mip: PSNR ") and (tmp_path / "out" / "mip" / files.SCENE).exists()
-    shutil.copytree(synthetic, tmp_path / "untested")
-    (tmp_path / "untested" / "transforms_test.json").unlink()
-    done = run(tmp_path / "untested")
+    done = run(untested(synthetic, tmp_path / "untested"))
     assert done.returncode == 1 and done.stderr.endswith("has no test pictures; out/mip has the scene\n")
 
 
@@ -1195,42 +1172,43 @@ def test_presets_give_way_to_what_is_given():
 
 
 def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, capsys):
-    small = ["--iterations", "3", "--random-points", "50", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
-    arguments = ["train", str(synthetic), "--out", str(tmp_path), *small]
-    assert cli.main([*arguments, "--preset", "3dgs", "--scales", "1,2", "--color-rate", "0.001"]) == 0
+    arguments = synthetic, tmp_path, "--iterations 3 --random-points 50 --sh-degree 0 --no-evaluate --preset 3dgs"
+    assert commands.train(*arguments, "--scales 1,2 --color-rate 0.001") == 0
     stored = TrainingOptions.from_dict(json.loads((tmp_path / files.OPTIONS).read_text())["options"])
     given = {"scales": (1, 2), "color_rate": 1e-3, "iterations": 3, "random_points": 50, "sh_degree": 0}
     assert stored == TrainingOptions.preset("3dgs", **given) and stored.scale_repeats == (1, 1)
     # The same options once more are no contradiction, with or without the scales; others are.
-    assert cli.main([*arguments, "--preset", "3dgs", "--color-rate", "0.001", "--resume"]) == 0
-    capsys.readouterr()
-    assert cli.main([*arguments, "--preset", "3dgs", "--resume"]) == 2
-    assert capsys.readouterr().err == "error: --color-rate: a resumed training keeps the options of its checkpoint\n"
+    assert commands.train(*arguments, "--color-rate 0.001 --resume") == 0
+    error = refused(capsys, commands.train, *arguments, "--resume")
+    assert error == "error: --color-rate: a resumed training keeps the options of its checkpoint\n"
+
+
+def older_checkpoint(folder, part, name) -> None:
+    """One from before it held something."""
+    state = files.read_checkpoint(folder / files.CHECKPOINT)
+    del state[part][name]
+    files.write_checkpoint(folder / files.CHECKPOINT, state)
 
 
 def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, capsys):
     start = Gaussians.from_points(*training.random_points(60, 0), 0)
     scatter(start)
     io.save_scene(tmp_path / "start.ply", start)
-    small = ["--iterations", "12", "--points", str(tmp_path / "start.ply")]
-    small += ["--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
-    dense, sparse = (["train", str(synthetic), "--out", str(tmp_path / name), *small] for name in ("dense", "sparse"))
-    assert cli.main(dense) == 0 and cli.main([*sparse, "--sparse-adam"]) == 0
+    small = ["--points", tmp_path / "start.ply", "--iterations 12 --sh-degree 0 --no-evaluate"]
+    dense, sparse = ((synthetic, tmp_path / name, *small) for name in ("dense", "sparse"))
+    assert commands.train(*dense) == 0 and commands.train(*sparse, "--sparse-adam") == 0
     for name in ("dense", "sparse"):
         stored = json.loads((tmp_path / name / files.OPTIONS).read_text())["options"]
         assert stored["sparse_adam"] is (name == "sparse")
     scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("dense", "sparse")]
     assert scenes[0] != scenes[1]
     # Whether or not it is given once more; a dense training does not become a sparse one.
-    assert cli.main([*sparse, "--resume"]) == 0 and cli.main([*sparse, "--resume", "--sparse-adam"]) == 0
-    capsys.readouterr()
-    assert cli.main([*dense, "--resume", "--sparse-adam"]) == 2
-    assert capsys.readouterr().err == "error: --sparse-adam: a resumed training keeps the options of its checkpoint\n"
+    assert commands.train(*sparse, "--resume") == 0 and commands.train(*sparse, "--resume --sparse-adam") == 0
+    error = refused(capsys, commands.train, *dense, "--resume --sparse-adam")
+    assert error == "error: --sparse-adam: a resumed training keeps the options of its checkpoint\n"
     # A checkpoint from before there was the option.
-    state = files.read_checkpoint(tmp_path / "dense" / files.CHECKPOINT)
-    del state["options"]["sparse_adam"]
-    files.write_checkpoint(tmp_path / "dense" / files.CHECKPOINT, state)
-    assert cli.main([*dense, "--resume"]) == 0
+    older_checkpoint(tmp_path / "dense", "options", "sparse_adam")
+    assert commands.train(*dense, "--resume") == 0
     assert (tmp_path / "dense" / files.SCENE).read_bytes() == scenes[0]
 
 
@@ -1238,25 +1216,22 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     monkeypatch.chdir(tmp_path)
     shutil.copy(trained / files.SCENE, "a.ply")
     shutil.copy(trained / files.SCENE, "b.ply")
-    small = ["--iterations", "2", "--sh-degree", "1", "--no-evaluate", "--device", "cpu"]
-    began, alone = (["train", str(synthetic), "--out", name, *small] for name in ("began", "alone"))
-    assert cli.main([*began, "--points", "a.ply"]) == 0
-    assert cli.main([*alone, "--random-points", "50"]) == 0
+    small = "--iterations 2 --sh-degree 1 --no-evaluate"
+    began, alone = ((synthetic, name, small) for name in ("began", "alone"))
+    assert commands.train(*began, "--points a.ply") == 0
+    assert commands.train(*alone, "--random-points 50") == 0
     assert json.loads((tmp_path / "began" / files.OPTIONS).read_text())["source"]["points"] == str(tmp_path / "a.ply")
-    for again in ([], ["--points", str(tmp_path / "a.ply")], ["--points", "a.ply"]):
-        assert cli.main([*began, "--resume", *again]) == 0
+    for again in ([], ["--points", tmp_path / "a.ply"], ["--points a.ply"]):
+        assert commands.train(*began, "--resume", *again) == 0
     written = {path: path.read_bytes() for folder in ("began", "alone") for path in (tmp_path / folder).iterdir()}
-    capsys.readouterr()
-    for command, expected in ((began, f"{tmp_path / 'a.ply'} or None"), (alone, "None")):
-        assert cli.main([*command, "--resume", "--points", "b.ply"]) == 2
-        error = f"error: points must be {expected} where a training is resumed, got {tmp_path / 'b.ply'}\n"
-        assert capsys.readouterr().err == error
+    for arguments, expected in ((began, f"{tmp_path / 'a.ply'} or None"), (alone, "None")):
+        error = refused(capsys, commands.train, *arguments, "--resume --points b.ply")
+        wrong = f"points must be {expected} where a training is resumed, got {tmp_path / 'b.ply'}"
+        assert error == f"error: {wrong}\n"
     assert all(path.read_bytes() == content for path, content in written.items())
     # A checkpoint from before they were noted.
-    state = files.read_checkpoint(tmp_path / "alone" / files.CHECKPOINT)
-    del state["source"]["points"]
-    files.write_checkpoint(tmp_path / "alone" / files.CHECKPOINT, state)
-    assert cli.main([*alone, "--resume", "--points", "b.ply"]) == 0
+    older_checkpoint(tmp_path / "alone", "source", "points")
+    assert commands.train(*alone, "--resume --points b.ply") == 0
 
 
 def test_resuming_takes_the_pictures_of_the_start_or_none(capture, tmp_path, capsys):
@@ -1264,20 +1239,18 @@ def test_resuming_takes_the_pictures_of_the_start_or_none(capture, tmp_path, cap
     folder, out = tmp_path / "scene", tmp_path / "out"
     shutil.copytree(capture, folder)
     shutil.copytree(folder / "photographs", folder / "images")
-    command = ["train", str(folder), "--out", str(out), "--iterations", "2", "--no-evaluate", "--device", "cpu"]
-    chosen = ["--images", "photographs", "--test-every", "4"]
-    assert cli.main([*command, *chosen]) == 0
+    command = folder, out, "--iterations 2 --no-evaluate"
+    chosen = ["--images photographs --test-every 4"]
+    assert commands.train(*command, *chosen) == 0
     for again in ([], chosen):
-        assert cli.main([*command, "--resume", *again]) == 0
+        assert commands.train(*command, "--resume", *again) == 0
         source = json.loads((out / files.OPTIONS).read_text())["source"]
         assert (source["images"], source["test_every"]) == ("photographs", 4)
     written = {path: path.read_bytes() for path in out.iterdir()}
-    capsys.readouterr()
-    refused = {"--images": ("images", "photographs", "images"), "--test-every": ("test_every", "4", "8")}
-    for option, (name, before, given) in refused.items():
-        assert cli.main([*command, "--resume", option, given]) == 2
-        error = f"error: {name} must be {before} or None where a training is resumed, got {given}\n"
-        assert capsys.readouterr().err == error
+    wrong = {"--images": ("images", "photographs", "images"), "--test-every": ("test_every", "4", "8")}
+    for option, (name, before, given) in wrong.items():
+        error = refused(capsys, commands.train, *command, "--resume", option, given)
+        assert error == f"error: {name} must be {before} or None where a training is resumed, got {given}\n"
     assert {path: path.read_bytes() for path in out.iterdir()} == written
 
 

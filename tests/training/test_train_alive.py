@@ -12,9 +12,10 @@ import pytest
 import runs
 import torch
 from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
+from commands import refused
 from train_extra import image
 
-from analytic_rasterizer import cli, io, training
+from analytic_rasterizer import io, training
 from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files
 
 QUICK = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 400}
@@ -107,8 +108,7 @@ def test_evaluation_on_the_capture_of_another_world_is_told(tmp_path, capsys):
     io.save_scene(tmp_path / "here.ply", scene)
     io.save_scene(tmp_path / "there.ply", scene._replace(means=scene.means + 500))
     for name, told in (("here", False), ("there", True)):
-        arguments = ["evaluate", tmp_path / f"{name}.ply", "--data", folder, "--lpips", "none", "--device", "cpu"]
-        assert cli.main([*map(str, arguments)]) == 0
+        assert commands.evaluate(tmp_path / f"{name}.ply", "--data", folder, "--device cpu") == 0
         assert ("no test picture shows any Gaussian" in capsys.readouterr().err) == told
 
 
@@ -172,9 +172,8 @@ def test_cameras_at_one_place_train(tmp_path, baseline, points):
 
 def test_cameras_with_one_pose_are_refused(tmp_path, capsys):
     folder = write_capture(tmp_path / "scene", [replace(circle(3)[1], name=f"r_{i}") for i in range(4)])
-    assert commands.train(folder, tmp_path / "out") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and "got all 3 at one place in one direction" in error
+    error = refused(capsys, commands.train, folder, tmp_path / "out")
+    assert "got all 3 at one place in one direction" in error
     assert not (tmp_path / "out").exists()
 
 
@@ -310,10 +309,9 @@ def test_no_file_holds_what_a_filter_makes_of_very_large_gaussians(orbit, tmp_pa
     ids=["size", "opacity"],
 )
 def test_no_gaussians_left_is_an_error(orbit, tmp_path, capsys, options, cause):
-    arguments = ["train", str(orbit), "--out", str(tmp_path), "--device", "cpu", "--save-every", "30"]
-    for name, value in (QUICK | {"iterations": 200, "densify_every": 20, "densify_from": 21} | options).items():
-        arguments += [f"--{name.replace('_', '-')}", str(value)]
-    assert cli.main(arguments) == 2
+    given = QUICK | {"iterations": 200, "densify_every": 20, "densify_from": 21, "save_every": 30} | options
+    words = [f"--{name.replace('_', '-')} {value}" for name, value in given.items()]
+    assert commands.train(orbit, tmp_path, *words) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: no Gaussians are left after step 40: ")
     assert re.search(cause, error) and "--prune-above" in error
@@ -359,9 +357,8 @@ def test_a_picture_without_gaussians_is_none(orbit, tmp_path):
 def test_a_start_from_transparent_gaussians_is_refused(orbit, tmp_path, capsys):
     scene = truth_gaussians()
     io.save_scene(tmp_path / "glass.ply", scene._replace(logit_opacities=torch.full((scene.count, 1), -math.inf)))
-    arguments = ["train", str(orbit), "--out", str(tmp_path / "out"), "--device", "cpu"]
-    assert cli.main([*arguments, "--points", str(tmp_path / "glass.ply")]) == 2
-    assert "glass.ply: all Gaussians are transparent (opacities below 1/255)" in capsys.readouterr().err
+    error = refused(capsys, commands.train, orbit, tmp_path / "out", "--points", tmp_path / "glass.ply")
+    assert "glass.ply: all Gaussians are transparent (opacities below 1/255)" in error
     assert not (tmp_path / "out").exists()
 
 
