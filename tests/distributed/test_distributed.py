@@ -32,10 +32,8 @@ CAMERAS = (
     (Camera(image_width=40, image_height=17, eye=(1.5, 0.4, -3.2)), "analytic"),
     (Camera(image_width=18, image_height=33, tanfovx=0.3, bg=(0.5, 0.0, 1.0)), "box:samples=16"),
     (Camera(image_width=27, image_height=21, eye=(-1.1, 0.2, -4.5)), "cumulant"),
-    (
-        Camera(image_width=27, image_height=21, eye=(0.9, 0.5, -3.6)),
-        "box:samples=4",
-    ),  # projected together with the first
+    # This one is projected together with the first.
+    (Camera(image_width=27, image_height=21, eye=(0.9, 0.5, -3.6)), "box:samples=4"),
     (Camera(image_width=31, image_height=18, eye=(9, 0, 0), target=(18, 0, 0), bg=(0.2, 0.7, 0.4)), "moment:samples=4"),
 )
 UNSEEING = 5  # of these cameras: it looks away from all Gaussians
@@ -84,6 +82,12 @@ def scene_of(dtype, device):
     scene["means3D"][COUNT // 2 :] = scene["means3D"][: COUNT // 2].flip(0)
     scene["means3D"][HIDDEN, 2] = -50
     return scenes.cast(scene, dtype, device)
+
+
+def shard_of_rank(scenario, rank, scene):
+    """The rows of a rank."""
+    first = sum(scenario.shards[:rank])
+    return {name: value[first : first + scenario.shards[rank]] for name, value in scene.items()}
 
 
 def settings_of(scenario, device):
@@ -260,8 +264,7 @@ class Full:
 def without_memory(rank, device, late):
     """What each rank of two makes, or raises, where rank 1 fails while the message is on its way."""
     scenario = SCENARIOS["two-ranks"]
-    first, count = sum(scenario.shards[:rank]), scenario.shards[rank]
-    scene = {name: value[first : first + count] for name, value in scene_of(scenario.dtype, device).items()}
+    first, scene = sum(scenario.shards[:rank]), shard_of_rank(scenario, rank, scene_of(scenario.dtype, device))
     settings = settings_of(scenario, device)
 
     def call(times, group=GROUPS[2], change=None):
@@ -294,9 +297,7 @@ def equal_effects(rank, device):
 
     There the first and the third are projected together.
     """
-    scenario = SHARING
-    first, count = sum(scenario.shards[:rank]), scenario.shards[rank]
-    scene = {name: value[first : first + count] for name, value in scene_of(scenario.dtype, device).items()}
+    scenario, scene = SHARING, shard_of_rank(SHARING, rank, scene_of(SHARING.dtype, device))
     settings = with_nears(settings_of(scenario, device), NEARS)
     if rank == 1:
         settings = [s._replace(effects=dataclasses.replace(s.effects)) for s in settings]
@@ -328,25 +329,21 @@ def work(rank, world, folder, kind):
         place = rank - (world - scenario.ranks)
         if place < 0:
             continue
-        first = sum(scenario.shards[:place])
-        rows = slice(first, first + scenario.shards[place])
-        scene = {name: value[rows] for name, value in scene_of(scenario.dtype, device).items()}
+        scene = shard_of_rank(scenario, place, scene_of(scenario.dtype, device))
         arguments = scenario, scene, settings_of(scenario, device), GROUPS[scenario.ranks], place not in scenario.frozen
         with mock.patch.object(dist, "all_to_all_single", wraps=dist.all_to_all_single) as calls:
             made = make(*arguments)
         made["sent"] = [call.args[1].nbytes for call in calls.call_args_list]
         with mock.patch.object(agreement, "_ROOM", 9):  # the counts of two cameras; those of others follow
             again = make(*arguments)
-        guesses = {name: Guess(*guess) for name, guess in guesses_of(first).items()}
+        guesses = {name: Guess(*guess) for name, guess in guesses_of(sum(scenario.shards[:place])).items()}
         by_guess = {name: guessed(guess, arguments) for name, guess in guesses.items()}
         torch.save((made, again, by_guess), f"{folder}/{name}-{place}.pt")
     if rank >= world - 2:
         place = rank - (world - 2)
-        torch.save(mistakes(place, device), f"{folder}/mistakes-{place}.pt")
-        torch.save(not_finite(place, device), f"{folder}/not-finite-{place}.pt")
-        torch.save(equal_effects(place, device), f"{folder}/equal-effects-{place}.pt")
-        torch.save(twice(place, device), f"{folder}/twice-{place}.pt")
-        torch.save(without_memory(place, device, late), f"{folder}/without-memory-{place}.pt")
+        for make_it in (mistakes, not_finite, equal_effects, twice):
+            torch.save(make_it(place, device), f"{folder}/{make_it.__name__}-{place}.pt")
+        torch.save(without_memory(place, device, late), f"{folder}/without_memory-{place}.pt")
     if rank == world - 1:
         torch.save(without_sending(device), f"{folder}/silent.pt")
     else:
@@ -374,8 +371,7 @@ def scene_not_finite(scenario, device):
 
 def not_finite(rank, device):
     scenario = SCENARIOS["two-ranks"]
-    rows = slice(0, scenario.shards[0]) if rank == 0 else slice(scenario.shards[0], COUNT)
-    scene = {name: value[rows] for name, value in scene_not_finite(scenario, device).items()}
+    scene = shard_of_rank(scenario, rank, scene_not_finite(scenario, device))
     return make(scenario, scene, settings_of(scenario, device), GROUPS[2])
 
 
@@ -518,13 +514,9 @@ def test_radii_and_gradients_of_means2d_are_where_the_gaussians_are(ran):
     scenario, made, _, expected = ran
     for camera in range(len(scenario.cameras)):
         given = trained(scenario, expected["ids"][camera])[:, None]
-        wanted = {
-            "ids": expected["ids"][camera],
-            "radii": expected["radii"][camera],
-            "means2d": expected["means2d"][camera] * given,
-        }
-        if scenario.means2d_abs:
-            wanted["absolute"] = expected["absolute"][camera]
+        names = ("ids", "radii", "means2d", *["absolute"] * scenario.means2d_abs)
+        wanted = {name: expected[name][camera] for name in names}
+        wanted["means2d"] = wanted["means2d"] * given
         for name, value in wanted.items():
             got = torch.cat([rank[name][camera] for rank in made])
             assert torch.equal(got, value), (name, camera, (got != value).nonzero().tolist(), (got - value).abs().max())
@@ -577,7 +569,7 @@ def test_colors_that_are_not_finite(runs):
     """Such Gaussians are in no picture and have no gradient; their rows are sent."""
     scenario = SCENARIOS["two-ranks"]
     scene = scene_not_finite(scenario, runs.kind)
-    made = [runs.load(f"not-finite-{rank}") for rank in range(2)]
+    made = [runs.load(f"not_finite-{rank}") for rank in range(2)]
     expected = plain(scenario, scene, settings_of(scenario, runs.kind))
     for rank in made:
         for k, camera in enumerate(rank["cameras"]):
@@ -596,7 +588,7 @@ def test_effects_may_be_shared_by_cameras_on_one_rank_only(runs):
     settings = with_nears(settings_of(scenario, runs.kind), NEARS)
     expected = plain(scenario, scene_of(scenario.dtype, runs.kind), settings)
     for rank in range(2):
-        made = runs.load(f"equal-effects-{rank}")
+        made = runs.load(f"equal_effects-{rank}")
         for k, camera in enumerate(made["cameras"]):
             assert torch.equal(made["images"][k], expected["images"][camera])
 
@@ -605,19 +597,16 @@ def test_what_fails_while_the_message_is_on_its_way_is_done_again(runs):
     """So the ranks agree about errors, whatever one of them could not begin."""
     made = [runs.load(f"two-ranks-{rank}")[0] for rank in range(2)]
     for rank in range(2):
-        found = runs.load(f"without-memory-{rank}")
+        found = runs.load(f"without_memory-{rank}")
         for name, value in found["while guessing"].items():
             torch.testing.assert_close(value, made[rank][name], rtol=0, atol=0)
-        assert found["another rank has raised"] == (
-            "ValueError",
-            "on rank 0: means3D must have shape (P, 3), got (5, 2)",
-        )
+        assert found["another rank has raised"] == ("ValueError", MISTAKES["shape"][1].replace("rank 1", "rank 0"))
 
 
 def test_a_rank_that_cannot_write_its_rows_ends_the_others_by_time_out(runs):
     if runs.kind == "cuda":
         pytest.skip("NCCL ends the process that waits in vain")
-    waited, raised = (runs.load(f"without-memory-{rank}")["for good"] for rank in range(2))
+    waited, raised = (runs.load(f"without_memory-{rank}")["for good"] for rank in range(2))
     assert raised == ("RuntimeError", "rows do not fit")
     assert launch._reason(waited[1], 1) == "time-out: another rank did not answer for 1 s (--rank-timeout)"
 
@@ -651,15 +640,8 @@ def calls_of(device, camera=0):
     blended = {"rows": rows[:n], "background": background, **image, "keep": True}
     color, alpha, saved = ops.blend_rows(**blended)
     width = _C.ROW_GRAD_WIDTHS[1]
-    back = {
-        "dL_drows": torch.zeros(n, width, device=device),
-        "dL_dimage": torch.ones_like(color),
-        "dL_dalpha": torch.ones_like(alpha),
-        "background": background,
-        **image,
-        "saved": saved,
-        "needs_background": True,
-    }
+    back = {"dL_drows": torch.zeros(n, width, device=device), "saved": saved, "needs_background": True, **image}
+    back |= {"dL_dimage": torch.ones_like(color), "dL_dalpha": torch.ones_like(alpha), "background": background}
     ops.blend_rows_vjp_(**back)
     dL_drows = torch.cat([back["dL_drows"]] * 2)
     needs = [name in ("means3D", "opacities", "shs", "scales", "rotations") for name in arguments][:11]
@@ -836,22 +818,25 @@ def test_depths_are_equal_in_pairs():
 # --- one rank ---------------------------------------------------------------------------------------
 
 
+def one_rank(device):
+    scenario = SCENARIOS["one-rank"]
+    return scenario, scene_of(scenario.dtype, device), settings_of(scenario, device)
+
+
 def test_one_rank_sends_nothing(runs):
     assert runs.load("silent") is None
 
 
 def test_without_torch_distributed_it_is_the_plain_path(device):
     """Where no process group was made: the same bits, forward and backward."""
-    scenario = SCENARIOS["one-rank"]
-    scene, settings = scene_of(scenario.dtype, device), settings_of(scenario, device)
+    scenario, scene, settings = one_rank(device)
     made, expected = make(scenario, scene, settings), plain(scenario, scene, settings)
     for name in ("images", "alphas", "ids", "radii", "means2d", "absolute", "gradients", "views", "bg"):
         torch.testing.assert_close(made[name], expected[name], rtol=0, atol=0)
 
 
 def test_without_gradient(device):
-    scenario = SCENARIOS["one-rank"]
-    scene, settings = scene_of(scenario.dtype, device), settings_of(scenario, device)
+    scenario, scene, settings = one_rank(device)
     with torch.no_grad():
         batch = distributed.rasterize(settings, **scene)
     assert [view.image.requires_grad for view in batch.renderings] == [False] * 4 and batch.means2d_abs == ()
@@ -890,47 +875,28 @@ def test_one_rank_says_what_is_wrong(change, error, message):
 
 # --- errors -----------------------------------------------------------------------------------------
 
+DIFFERENCE = "got a difference between ranks 0 and 1"
+OTHER_CAMERAS = ("ValueError", f"settings, owners and means2d_abs must be the same on every rank, {DIFFERENCE}")
 MISTAKES = {
     "shape": ("ValueError", "on rank 1: means3D must have shape (P, 3), got (5, 2)"),
     "tensor": ("TypeError", "on rank 1: opacities must be a tensor, got NoneType"),
     "no cameras": ("ValueError", "on rank 1: settings must hold at least one camera, got none"),
-    "cameras": (
-        "ValueError",
-        "settings must hold as many cameras on every rank, got a difference between ranks 0 and 1: 4 and 3",
-    ),
-    "matrix": (
-        "ValueError",
-        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
-    "camera gradients": (
-        "ValueError",
-        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
+    "cameras": ("ValueError", f"settings must hold as many cameras on every rank, {DIFFERENCE}: 4 and 3"),
+    "matrix": OTHER_CAMERAS,
+    "camera gradients": OTHER_CAMERAS,
     "owners": ("ValueError", "on rank 0: owners must be ranks from 0 to 1, got 2 for camera 2"),
-    "other owners": (
-        "ValueError",
-        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
+    "other owners": OTHER_CAMERAS,
     "colors": ("ValueError", "on rank 1: shs or colors_precomp must be given, got neither"),
     "bg": ("ValueError", "on rank 1: bg must have shape (3,), got (4,) of camera 0"),
     "auto": ("ValueError", 'on rank 0: effects must not be "auto", which looks at all Gaussians, got it of camera 0'),
-    "swapped": (
-        "ValueError",
-        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
-    "effects": (
-        "ValueError",
-        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
+    "swapped": OTHER_CAMERAS,
+    "effects": OTHER_CAMERAS,
     "dtype": (
         "ValueError",
-        "means3D must have one dtype and one kind of device on every rank, got a difference between ranks 0 and 1: "
+        f"means3D must have one dtype and one kind of device on every rank, {DIFFERENCE}: "
         "torch.float32 on cpu and torch.float64 on cpu",
     ),
-    "grad": (
-        "ValueError",
-        "gradients must be enabled on every rank or on none, got a difference between ranks 0 and 1: 1 and 0",
-    ),
+    "grad": ("ValueError", f"gradients must be enabled on every rank or on none, {DIFFERENCE}: 1 and 0"),
 }
 
 

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from processes import DEADLINE, start_processes
 from scenes import Camera
-from test_distributed import COUNT, error_of, scene_of, with_camera_gradients
+from test_distributed import COUNT, DIFFERENCE, error_of, scene_of, with_camera_gradients
 from weights import weights as weights_of
 
 import analytic_rasterizer as ar
@@ -62,19 +62,11 @@ def band_of(footprint, dtype, sizes, rank, group=None, camera=None):
     first, end = band.rows[rank]
     of_band = weights(settings.image_height, settings.image_width)[:, first:end].to(dtype)
     (band.anchor + (torch.cat([band.image, band.alpha]) * of_band).sum()).backward()
-    return {
-        "rows": band.rows,
-        "image": band.image.detach(),
-        "alpha": band.alpha.detach(),
-        "whole": band.whole(),
-        "gradients": {name: leaf.grad for name, leaf in leaves.items()},
-        "means2d": band.shard.means2d.grad,
-        "absolute": band.means2d_abs.grad,
-        "ids": band.shard.gaussian_ids + band.first_id,
-        "view": view.grad,
-        "bg": torch.zeros_like(bg) if bg.grad is None else bg.grad,
-        "count": band.count,
-    }
+    made = {"rows": band.rows, "image": band.image.detach(), "alpha": band.alpha.detach(), "whole": band.whole()}
+    made |= {"gradients": {name: leaf.grad for name, leaf in leaves.items()}, "means2d": band.shard.means2d.grad}
+    made |= {"absolute": band.means2d_abs.grad, "ids": band.shard.gaussian_ids + band.first_id, "view": view.grad}
+    made |= {"bg": torch.zeros_like(bg) if bg.grad is None else bg.grad, "count": band.count}
+    return made
 
 
 def background_alone(sizes, rank):
@@ -105,15 +97,10 @@ def of_one_process(footprint, dtype, rows):
         parts.append(torch.autograd.grad(loss, [*of_splats, absolute, bg], retain_graph=True))
     sums = [sum(of_band) for of_band in zip(*parts)]
     found = torch.autograd.grad(of_splats, [*leaves.values(), view], sums[:4])
-    return {
-        "image": image[0].detach(),
-        "alpha": alpha[0].detach(),
-        "means2d": [part[0] for part in parts],
-        "absolute": [part[4] for part in parts],
-        "bg": [part[5] for part in parts],
-        "gradients": dict(zip(leaves, found)),
-        "view": found[-1],
-    }
+    made = {"image": image[0].detach(), "alpha": alpha[0].detach(), "means2d": [part[0] for part in parts]}
+    made |= {"absolute": [part[4] for part in parts], "bg": [part[5] for part in parts]}
+    made |= {"gradients": dict(zip(leaves, found)), "view": found[-1]}
+    return made
 
 
 def band_mistake(rank):
@@ -382,14 +369,8 @@ def test_gsplats_distributed_in_one_process_changes_nothing():
 
 MISTAKES = {
     "shape": ("ValueError", "on rank 1: quats must have shape (30, 4), got (3, 4)"),
-    "width": (
-        "ValueError",
-        "all arguments but tensors must be the same on every rank, got a difference between ranks 0 and 1",
-    ),
-    "cameras": (
-        "ValueError",
-        "viewmats must hold as many cameras on every rank, got a difference between ranks 0 and 1: 2 and 1",
-    ),
+    "width": ("ValueError", f"all arguments but tensors must be the same on every rank, {DIFFERENCE}"),
+    "cameras": ("ValueError", f"viewmats must hold as many cameras on every rank, {DIFFERENCE}: 2 and 1"),
     "refused": ("RuntimeError", "on rank 1: sparse_grad is not supported: gradients are dense tensors"),
     "batch": ("ValueError", "on rank 1: means must have no leading dimensions where distributed is True, got (1,)"),
     "bands": ("ValueError", "on rank 1: means3D must have shape (P, 3), got (5, 2)"),

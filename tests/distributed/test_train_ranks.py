@@ -17,7 +17,7 @@ import runs
 import torch
 import torch.distributed as dist
 import train_extra  # noqa: F401
-from capture_files import circle, opengl_pose, write_pictures
+from capture_files import circle, write_nerf_synthetic
 from processes import DEADLINE, in_threads, python_path, run_program, start_processes
 from runs import TINY, rows_shown, scatter
 from torch.distributed import distributed_c10d
@@ -36,27 +36,13 @@ STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and f
 HALF = 24  # where the others have a break
 COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "densify_until": 0.9}
 COMMON |= {"densify_from": 10, "densify_every": 10, "density": "3dgs", "gradient_scales": "all"}
+LARGER_STEPS = {"pictures_per_step": 2, "supersampling": 2}
 VARIANTS = {
     "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
     "sparse": {"sparse_adam": True},
-    "mcmc": {
-        "density": "mcmc",
-        "max_gaussians": 150,
-        "background": "random",
-        "pictures_per_step": 2,
-        "supersampling": 2,
-    },
+    "mcmc": {"density": "mcmc", "max_gaussians": 150, "background": "random", **LARGER_STEPS},
 }
 CAMERAS = 2  # of the step whose gradients are compared
-
-
-def write_scene(folder):
-    """A scene in the files of NeRF-synthetic."""
-    for split, views in (("train", circle(7)), ("test", circle(4))):
-        write_pictures(folder / split, views, opaque=False)
-        frames = [{"file_path": f"./{split}/{v.name}", "transform_matrix": opengl_pose(v)} for v in views]
-        content = {"camera_angle_x": 2 * math.atan(32 / 72), "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
 def make_run(scene, out, ranks, **given):
@@ -229,7 +215,7 @@ def wait_in_vain(group, folder):
 def made(tmp_path_factory):
     """The folder into which the processes have written."""
     folder = tmp_path_factory.mktemp("ranks")
-    write_scene(folder / "scene")
+    write_nerf_synthetic(folder / "scene", circle(7), circle(4))
     start_processes(work, (WORLD, folder), WORLD)
     return folder
 
