@@ -9,6 +9,7 @@ import pytest
 import reference
 import torch
 from cli_extra import image
+from commands import refused
 from places import ROOT
 
 import analytic_rasterizer as ar
@@ -95,11 +96,9 @@ def test_the_two_references_agree_within_the_monte_carlo_error():
 
 
 def test_a_wrong_reference_is_noticed(monkeypatch):
-    monkeypatch.setattr(
-        errors,
-        "footprint_weight",
-        lambda d, c, name: ar.footprint_weight(d, c, name) * (1.02 if name == "exact" else 1.0),
-    )
+    right = ar.footprint_weight
+    wrong = lambda d, c, name: right(d, c, name) * (1.02 if name == "exact" else 1.0)  # noqa: E731
+    monkeypatch.setattr(errors, "footprint_weight", wrong)
     rows = errors.rotation_errors(samples=32, monte_carlo=4096, sigmas=4)
     assert max(row["z_rms"] for row in rows) > 2
 
@@ -203,9 +202,8 @@ def test_files_of_a_run(small):
 def test_summary_says_from_where_on_an_error_stays_small(small):
     _, results = small
     table = results["summary"].partition("stays below:")[2].splitlines()
-    cells = {
-        line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:-1]] for line in table if "|" in line
-    }
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table if "|" in line]
+    cells = {name: row for name, *row in rows}
     assert cells["footprint"] == ["1e-02", "1e-03", "1e-04"]
     assert set(cells) == {"footprint", "---", "point", "analytic", "cumulant"}
     assert cells["analytic"][1:] == ["> 20", "> 20"]
@@ -253,9 +251,4 @@ def test_missing_library_names_the_extra(monkeypatch, tmp_path, capsys, module):
     ],
 )
 def test_wrong_arguments_are_one_line(args, message, capsys):
-    with pytest.raises(SystemExit) as stop:
-        paper_errors.main([*args])
-    assert stop.value.code == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
+    assert message in refused(capsys, paper_errors.main, args)

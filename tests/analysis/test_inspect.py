@@ -234,12 +234,8 @@ def test_report_in_words_and_json(device):
 def test_bad_numbers(device, tolerance):
     """Gaussians that are not finite are culled, and do not hide what the others call for."""
     scene = random_scene(device, count=200, bands="large")
-    scene.means[3], scene.shs[5, 12], scene.logit_opacities[7], scene.log_scales[9] = (
-        math.nan,
-        math.nan,
-        math.nan,
-        math.inf,
-    )
+    scene.means[3], scene.shs[5, 12], scene.logit_opacities[7] = (math.nan,) * 3
+    scene.log_scales[9] = math.inf
     found = ar.inspect_scene(scene, settings(device), tolerance, settings(device), rounds=1)
     check_recommendation(scene, settings(device), found)
     assert not found.shown[[3, 5, 7, 9]].any() and found.effects.sh_degree is None

@@ -574,9 +574,8 @@ def test_comments_of_other_programs(tmp_path, name, lines, expected):
     content = path.read_bytes()
     for newline in (b"\n", b"\r\n"):
         header, end, rows = content.partition(b"end_header\n")
-        header = header.replace(
-            b"element vertex", "".join(f"comment {line}\n" for line in lines).encode() + b"element vertex"
-        )
+        comments = "".join(f"comment {line}\n" for line in lines).encode()
+        header = header.replace(b"element vertex", comments + b"element vertex")
         path.write_bytes((header + end).replace(b"\n", newline) + rows)
         assert io.read_metadata(path) == expected
 

@@ -181,6 +181,7 @@ REFUSED = {
     "one byte too few": (ply(SCENE)[:-1], CUT + "5"),
     "one line too few": (TEXT.rsplit(b"\n", 2)[0], "cut short: expected 5 vertices, got 4"),
     "one word too few": (TEXT.rsplit(b" ", 1)[0], "expected 23 numbers in every row"),
+    "a word in Latin-1": (TEXT.rsplit(b" ", 1)[0] + b" \xff\n", "expected 23 numbers in every row"),
     "no number": (TEXT.replace(b"\n0.", b"\nfour 0."), "expected 23 numbers in every row"),
     "too large a number": (BYTES.replace(b" 255\n", b" 256\n"), "expected 24 numbers in every row"),
     "a huge number of vertices": (ply(SCENE).replace(b"vertex 5", b"vertex 4000000000"), CUT + "4000000000"),

@@ -104,16 +104,14 @@ def without_a_reason(temporary):
     raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 704 vs 598")
 
 
-@pytest.mark.parametrize(
-    "write",
-    [
-        raising(OSError(errno.ENOSPC, "No space left on device")),
-        raising(OSError(errno.EDQUOT, "Disk quota exceeded")),
-        pytest.param(
-            without_a_reason, marks=pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-        ),
-    ],
-)
+needs_dev_full = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+FULL = [
+    raising(OSError(errno.ENOSPC, "No space left on device")),
+    raising(OSError(errno.EDQUOT, "Disk quota exceeded")),
+]
+
+
+@pytest.mark.parametrize("write", [*FULL, pytest.param(without_a_reason, marks=needs_dev_full)])
 def test_a_full_disk_is_called_so(tmp_path, write):
     (tmp_path / "a.pt").write_bytes(BEFORE)
     expected = f"{tmp_path / 'a.pt'}: the disk is full; an earlier file of this name is unchanged"

@@ -96,16 +96,31 @@ def wait_for_frame(page):
     wait_for(page, "() => document.getElementById('figures').textContent !== ''")
 
 
+@contextmanager
+def page_of(browser, scene, views, query="?view=0", wait=wait_until_ready, of_page=None, **options):
+    """A page that shows a scene on a server of its own, after `wait(page)`. `of_page`: options of `open_page`."""
+    views = views if isinstance(views, list) else [views]
+    of_page = of_page or {}
+    with serve(scene, views, **options) as server, open_page(browser, f"{server.url}{query}", **of_page) as page:
+        wait(page)
+        yield page
+
+
 def settle(page):
-    """The picture on the screen once it is what was asked for, as PNG."""
+    """Waits until the picture on the screen is what was asked for."""
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
     wait_for(page, "() => document.getElementById('surface').getAttribute('aria-busy') === 'false'")
-    return page.screenshot(type="png")
+
+
+def screenshot(page):
+    """The settled picture on the screen, (H, W, 3) uint8."""
+    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+    settle(page)
+    return np.asarray(image.open(BytesIO(page.screenshot(type="png"))).convert("RGB"))
 
 
 def check_photographs(browser, query=""):
     """A photograph is beside the picture of its view, where the view reaches, and the heat map shows the difference."""
-    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
     scene, view = random_scene(300), replace(facing(), width=320, height=240, fx=300.0, fy=300.0)
     taken = rendered(scene, view, "point")
     taken[:, 60:120, 160:] = 1.0  # a part that the scene has not
@@ -113,7 +128,7 @@ def check_photographs(browser, query=""):
     io.to_image(torch.from_numpy(taken)).save(file, "PNG")
 
     def picture(page):
-        return np.asarray(image.open(BytesIO(settle(page))).convert("RGB")).astype(int)[50:122]  # not covered
+        return screenshot(page).astype(int)[50:122]  # not covered
 
     with (
         serve(scene, [view, turned_view()], {0: file.getvalue}, footprint="point") as server,

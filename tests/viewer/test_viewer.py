@@ -11,6 +11,7 @@ import subprocess
 import threading
 from io import BytesIO
 
+import commands
 import numpy as np
 import pytest
 import torch
@@ -105,9 +106,8 @@ def floor(across, thickness, count=400):
     scales[:, across] = 1e-4
     rotations = torch.randn(2 * count, 4, generator=g)
     rotations[:count] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    return Gaussians.from_activated(
-        means, scales, rotations, torch.full((2 * count, 1), 0.9), torch.zeros(2 * count, 1, 3)
-    )
+    opacities, shs = torch.full((2 * count, 1), 0.9), torch.zeros(2 * count, 1, 3)
+    return Gaussians.from_activated(means, scales, rotations, opacities, shs)
 
 
 def picture():
@@ -166,20 +166,12 @@ def test_an_empty_scene_is_refused():
         viewer.pack_scene(make_scene(0), name="garden.ply")
 
 
-@pytest.mark.parametrize(
-    "given, name",
-    [
-        ("analytic", "analytic"),
-        ("analytic:frame_gradient=paper", "analytic"),
-        ("box", "box:samples=4"),
-        ("point", "point"),
-        ("point:dilation=0", "point:dilation=0.0"),
-        ("mip:variance=0.3", "mip:variance=0.3"),
-        ("cumulant", "cumulant"),
-        ("moment", "moment:samples=4"),
-        ("moment:samples=16", "moment:samples=16"),
-    ],
-)
+WHOLE_NAMES = {"analytic:frame_gradient=paper": "analytic", "box": "box:samples=4", "moment": "moment:samples=4"}
+WHOLE_NAMES |= {"point:dilation=0": "point:dilation=0.0"}
+WHOLE_NAMES |= {name: name for name in ("analytic", "point", "mip:variance=0.3", "cumulant", "moment:samples=16")}
+
+
+@pytest.mark.parametrize("given, name", WHOLE_NAMES.items())
 def test_names_of_footprints(given, name):
     assert viewer.page_footprint(ar.resolve_footprint(given)) == name
 
@@ -276,20 +268,10 @@ def test_without_the_token_nothing_is_served(server, path):
     connection.close()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "missing.js",
-        "../server.py",
-        "../../../../../../etc/passwd",
-        "%2e%2e/server.py",
-        "page/index.html",
-        "//etc/passwd",
-        "/index.html",
-        "index.html/",
-        "INDEX.HTML",
-    ],
-)
+NOT_LISTED = "missing.js ../server.py ../../../../../../etc/passwd %2e%2e/server.py page/index.html //etc/passwd"
+
+
+@pytest.mark.parametrize("name", [*NOT_LISTED.split(), "/index.html", "index.html/", "INDEX.HTML"])
 def test_nothing_but_the_listed_files_is_served(server, name):
     assert ask(server, f"/{server.token}/{name}")[0] == 404
 
@@ -402,8 +384,7 @@ def test_a_training_knows_the_photographs_of_its_views(tmp_path, monkeypatch):
     write_colmap(data / "sparse" / "0", cameras, torch.randn(9, 3), torch.zeros(9, 3, dtype=torch.int32))
     (data / "images").mkdir()
     write_pictures(data / "images", cameras, opaque=True)
-    arguments = ["--iterations", "1", "--scales", "2,4", "--test-every", "0", "--device", "cpu"]
-    assert cli.main(["train", str(data), "--out", str(out), *arguments]) == 0
+    assert commands.train(data, out, "--iterations 1 --scales 2,4 --test-every 0") == 0
 
     monkeypatch.setattr("analytic_rasterizer.training.colmap.load_points", lambda _: pytest.fail("reads the points"))
     found = io.find_scene(out)
@@ -433,17 +414,17 @@ def test_the_background_is_that_of_the_file(files):
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["missing.ply"], "no such file"),
-        (["scene.ply", "--footprint", "exact"], "viewer can draw"),
-        (["scene.ply", "--footprint", "box:samples=3"], "samples must be one of"),
-        (["scene.ply", "--views", "missing.json"], "missing.json"),
-        (["scene.ply", "--export", "out.txt"], "--export must end in .html"),
-        (["scene.ply", "--export", "out.html", "--port", "8000"], "--port is for serving"),
-        (["scene.ply", "--export", "out.html", "--device", "cpu"], "--device and --threads are for --server"),
-        (["scene.ply", "--export", "missing/out.html"], "No such file or directory"),
-        (["broken.ply"], "broken.ply"),
-        (["empty.ply"], "no Gaussians"),
-        (["broken.spz"], "broken.spz"),
+        ("missing.ply", "no such file"),
+        ("scene.ply --footprint exact", "viewer can draw"),
+        ("scene.ply --footprint box:samples=3", "samples must be one of"),
+        ("scene.ply --views missing.json", "missing.json"),
+        ("scene.ply --export out.txt", "--export must end in .html"),
+        ("scene.ply --export out.html --port 8000", "--port is for serving"),
+        ("scene.ply --export out.html --device cpu", "--device and --threads are for --server"),
+        ("scene.ply --export missing/out.html", "No such file or directory"),
+        ("broken.ply", "broken.ply"),
+        ("empty.ply", "no Gaussians"),
+        ("broken.spz", "broken.spz"),
     ],
 )
 def test_mistakes_are_one_sentence(files, monkeypatch, capsys, arguments, sentence):
@@ -453,8 +434,7 @@ def test_mistakes_are_one_sentence(files, monkeypatch, capsys, arguments, senten
     (files / "broken.spz").write_bytes(b"not an spz")
     header, _ = ply.split(b"end_header\n")
     (files / "empty.ply").write_bytes(header.replace(b"element vertex 30", b"element vertex 0") + b"end_header\n")
-    error = refused(capsys, run_view, *arguments)
-    assert sentence in error
+    assert sentence in refused(capsys, commands.command, "view", arguments)
 
 
 @pytest.mark.parametrize("port", ["-1", "65536", "http"])

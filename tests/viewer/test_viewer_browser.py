@@ -20,7 +20,9 @@ from chromium import (
     launch,
     off_centre,
     open_page,
+    page_of,
     pixels,
+    screenshot,
     settle,
     wait_for,
     wait_for_frame,
@@ -60,19 +62,14 @@ def browser():
 @pytest.fixture(scope="module")
 def demo_page(browser):
     scene, view = demo.make_target()
-    with (
-        serve(scene, [view], background=demo.PAPER) as server,
-        open_page(browser, f"{server.url}?view=0&size=16x16") as page,
-    ):
-        wait_until_ready(page)
+    with page_of(browser, scene, view, "?view=0&size=16x16", background=demo.PAPER) as page:
         yield page, scene, view
 
 
 @pytest.fixture(scope="module")
 def random_page(browser):
     scene, view = random_scene(), turned_view()
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&size=16x16") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, "?view=0&size=16x16") as page:
         yield page, scene, view
 
 
@@ -98,8 +95,7 @@ def test_random_scene(random_page, footprint, reduction):
 def test_hard_scenes(browser, case):
     make_scene, make_view = HARD[case]
     scene, view = make_scene(), make_view()
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view) as page:
         assert np.array_equal(pixels(page, view.width, view.height), drawn(page, "analytic", view.width, view.height))
         for footprint in ("point", "analytic", "box:samples=1"):
             assert_same(drawn(page, footprint, view.width, view.height), rendered(scene, view, footprint))
@@ -107,8 +103,7 @@ def test_hard_scenes(browser, case):
 
 def test_several_views(browser):
     scene, views = random_scene(500), [facing(), turned_view()]
-    with serve(scene, views) as server, open_page(browser, f"{server.url}?view=1&footprint=mip") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, views, "?view=1&footprint=mip") as page:
         assert_same(pixels(page, 160, 120), rendered(scene, views[1], "mip"))
         assert_same(drawn(page, "mip", 160, 120, view=0), rendered(scene, views[0], "mip"))
 
@@ -122,8 +117,7 @@ def test_trained_scene(browser, name, request):
     camera = cameras[0]
     w2c = torch.tensor(camera["w2c"], dtype=torch.float64).reshape(4, 4)
     view = io.View("trained", camera["width"], camera["height"], camera["fx"], camera["fy"], w2c).scaled(0.5)
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&footprint=analytic") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, "?view=0&footprint=analytic") as page:
         error = np.abs(pixels(page, view.width, view.height) - rendered(scene, view, "analytic"))
         assert 255 * np.quantile(error, 0.9999) <= 2
 
@@ -141,8 +135,7 @@ def without(extension):
 def test_half_floats_are_a_fallback(browser, footprint):
     scene, view = random_scene(), turned_view()
     init = without("EXT_float_blend")
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0", init=init) as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, of_page={"init": init}) as page:
         ours = drawn(page, footprint, view.width, view.height)
         assert np.array_equal(ours, ours.astype(np.float16))
         assert_same(ours, rendered(scene, view, footprint), rms=ROOT_MEAN_SQUARE_OF_HALVES)
@@ -161,8 +154,7 @@ def test_photographs_are_beside_the_pictures_of_their_views(browser):
 
 def test_what_the_screen_shows_is_the_picture(browser):
     scene, view = random_scene(500), facing()
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&footprint=mip") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, "?view=0&footprint=mip") as page:
         shown = page.evaluate(
             """async () => {
               await analyticRender(0, 'mip', 160, 120);
@@ -186,8 +178,7 @@ def test_an_exported_file_looks_the_same_without_network(browser, tmp_path):
     with open_page(browser, f"{path.as_uri()}?view=0", offline=True) as page:
         wait_until_ready(page)
         exported = pixels(page, view.width, view.height)
-    with serve(scene, [view], footprint="mip") as server, open_page(browser, f"{server.url}?view=0") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, footprint="mip") as page:
         assert np.array_equal(exported, pixels(page, view.width, view.height))
     assert_same(exported, rendered(scene, view, "mip"))
     with open_page(browser, path.as_uri(), offline=True) as page:
@@ -203,8 +194,7 @@ def test_an_exported_file_looks_the_same_without_network(browser, tmp_path):
 @pytest.mark.gate
 def test_a_lost_context_comes_back(browser):
     scene, view = random_scene(500), turned_view()
-    with serve(scene, [view]) as server, open_page(browser, server.url) as page:
-        wait_for_frame(page)
+    with page_of(browser, scene, view, "", wait_for_frame) as page:
         page.evaluate(
             """() => {
               window.loser = canvas.getContext('webgl2').getExtension('WEBGL_lose_context');
@@ -222,8 +212,7 @@ def test_a_lost_context_comes_back(browser):
 
 def test_a_picture_whose_context_is_lost_is_drawn_again(browser):
     scene, view = random_scene(500), turned_view()
-    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&size=16x16") as page:
-        wait_until_ready(page)
+    with page_of(browser, scene, view, "?view=0&size=16x16") as page:
         said = page.evaluate(
             """async ([footprint, width, height]) => {
               const loser = canvas.getContext('webgl2').getExtension('WEBGL_lose_context');
@@ -293,11 +282,8 @@ def test_bad_requests_of_automation_are_a_sentence(browser, query):
 def controls(browser):
     """A page for a user who prefers no motion, so that journeys end at once."""
     scene, views = random_scene(500), [facing(), turned_view(), off_centre()]
-    with (
-        serve(scene, views, name="room.ply") as server,
-        open_page(browser, server.url, reduced_motion="reduce") as page,
-    ):
-        wait_for_frame(page)
+    still = {"reduced_motion": "reduce"}
+    with page_of(browser, scene, views, "", wait_for_frame, still, name="room.ply") as page:
         yield page
 
 
@@ -399,8 +385,7 @@ def test_views(controls):
 @pytest.mark.gate
 def test_the_page_says_where_a_view_is_shown_without_its_lens(browser):
     views = [facing(), replace(turned_view(), lens=ar.Lens.fisheye((0.05,)))]
-    with serve(random_scene(50), views) as server, open_page(browser, server.url, reduced_motion="reduce") as page:
-        wait_for_frame(page)
+    with page_of(browser, random_scene(50), views, "", wait_for_frame, of_page={"reduced_motion": "reduce"}) as page:
         assert page.is_hidden("#note")
         page.keyboard.press(".")
         assert page.text_content("#note") == "This view is shown without its lens."
@@ -468,16 +453,14 @@ def test_a_double_click_focuses_what_is_there(controls):
 
 def test_the_camera_travels_between_views(browser):
     views = [facing(), turned_view()]
-    with serve(random_scene(100), views) as server, open_page(browser, server.url) as page:
-        wait_for_frame(page)
+    with page_of(browser, random_scene(100), views, "", wait_for_frame) as page:
         page.keyboard.press(".")
         # At the end it is at the view exactly: the address needs no pose.
         wait_for(page, "() => location.hash.includes('view=1') && !location.hash.includes('camera=')")
 
 
 def test_two_fingers_zoom(browser):
-    with serve(random_scene(100), [facing()]) as server, open_page(browser, server.url, has_touch=True) as page:
-        wait_for_frame(page)
+    with page_of(browser, random_scene(100), facing(), "", wait_for_frame, of_page={"has_touch": True}) as page:
         touch = page.context.new_cdp_session(page)
 
         def fingers(kind, *places):
@@ -507,11 +490,10 @@ def test_the_wheel_never_loses_the_scene(controls):
 
 
 def test_the_background_can_be_chosen(controls):
-    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
     controls.fill("#background", "#3060c0")
     wait_for(controls, "() => location.hash.includes('background=3060c0')")
     controls.keyboard.press("h")
-    shown = np.asarray(image.open(BytesIO(settle(controls))).convert("RGB"))
+    shown = screenshot(controls)
     assert (shown == [0x30, 0x60, 0xC0]).all(axis=2).any()
 
 
@@ -559,8 +541,7 @@ def test_a_key_folds_and_unfolds_the_controls(controls):
 
 def test_on_a_phone_the_controls_leave_the_scene_free(browser):
     phone = {"has_touch": True, "is_mobile": True}
-    with serve(random_scene(100), [facing()]) as server, open_page(browser, server.url, **phone) as page:
-        wait_for_frame(page)
+    with page_of(browser, random_scene(100), facing(), "", wait_for_frame, of_page=phone) as page:
         assert page.is_hidden("#footprint")
         page.tap("#fold")
         assert page.is_visible("#footprint")
@@ -604,10 +585,8 @@ def test_a_screenshot_is_saved(controls):
 
 
 def test_side_by_side_shows_both(controls):
-    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-
     def picture():
-        return np.asarray(image.open(BytesIO(settle(controls))).convert("RGB"))[50:100]  # without names and controls
+        return screenshot(controls)[50:100]  # without names and controls
 
     controls.keyboard.press("h")
     controls.keyboard.press("1")
@@ -648,8 +627,7 @@ def test_the_order_is_that_of_a_stable_sort(browser):
     depths = np.random.default_rng(0).choice(np.linspace(0.1, 50, 997), 20000).astype(np.float32)
     means = np.zeros((20000, 12), np.float32)
     means[:, 2] = depths
-    with serve(random_scene(10), [facing()]) as server, open_page(browser, server.url) as page:
-        wait_for_frame(page)
+    with page_of(browser, random_scene(10), facing(), "", wait_for_frame) as page:
         script = """async text => {
           const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
           const worker = new Worker('sort.js');

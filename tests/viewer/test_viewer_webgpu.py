@@ -6,7 +6,6 @@ software.
 
 import re
 from dataclasses import replace
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -19,7 +18,9 @@ from chromium import (
     facing,
     launch,
     open_page,
+    page_of,
     pixels,
+    screenshot,
     settle,
     wait_for,
     wait_for_frame,
@@ -57,6 +58,10 @@ def open_gpu(browser, server, query="", **options):
     return open_page(browser, f"{server.url}?renderer=webgpu{query}", **options)
 
 
+def gpu_page_of(browser, scene, views, query="", *given, **options):
+    return page_of(browser, scene, views, f"?renderer=webgpu{query}", *given, **options)
+
+
 def small(view, size=96):
     return view.scaled(size / view.width)
 
@@ -64,8 +69,7 @@ def small(view, size=96):
 @pytest.fixture(scope="module")
 def settled(browser):
     scene, view, background = random_scene(), small(turned_view()), (0.2, 0.3, 0.4)
-    with serve(scene, [view], background=background) as server, open_gpu(browser, server, "&view=0&size=16x16") as page:
-        wait_until_ready(page)
+    with gpu_page_of(browser, scene, view, "&view=0&size=16x16", background=background) as page:
         yield page, scene, view, background
 
 
@@ -98,8 +102,7 @@ HARD_AND_DEMO = HARD | {"demo": (lambda: demo.make_target()[0], lambda: demo.mak
 def test_hard_scenes(browser, case):
     make_scene, make_view = HARD_AND_DEMO[case]
     scene, view = make_scene(), small(make_view())
-    with serve(scene, [view]) as server, open_gpu(browser, server, "&view=0&footprint=analytic") as page:
-        wait_until_ready(page)
+    with gpu_page_of(browser, scene, view, "&view=0&footprint=analytic") as page:
         assert_same(pixels(page, view.width, view.height), rendered(scene, view, "analytic"))
         ours = drawn(page, "moment:samples=4", view.width, view.height)
         assert_same(ours, rendered(scene, view, "moment:samples=4"))
@@ -160,8 +163,7 @@ def test_compact_scenes(browser, degree):
         assert torch.allclose(getattr(told, name), getattr(scene, name), atol=atol, rtol=1e-3), name
     turned = (told.rotations * torch.nn.functional.normalize(scene.rotations)).sum(1).abs()
     assert turned.min() > np.cos(0.003)  # radians of half of the angle
-    with serve(scene, [view], compact=True) as server, open_gpu(browser, server, "&view=0&size=16x16") as page:
-        wait_until_ready(page)
+    with gpu_page_of(browser, scene, view, "&view=0&size=16x16", compact=True) as page:
         picture = drawn(page, "moment:samples=4", view.width, view.height)
     assert_same(picture, rendered(told, view, "moment:samples=4"))
 
@@ -182,11 +184,8 @@ def test_compact_scenes_need_webgpu(browser):
 
 
 def test_a_compact_scene_has_places_to_focus_on(browser):
-    with (
-        serve(random_scene(300), [facing()], compact=True) as server,
-        open_gpu(browser, server, reduced_motion="reduce") as page,
-    ):
-        wait_for_frame(page)
+    still = {"reduced_motion": "reduce"}
+    with gpu_page_of(browser, random_scene(300), facing(), "", wait_for_frame, still, compact=True) as page:
         page.mouse.dblclick(200, 60)
         wait_for(page, "() => location.hash.includes('camera=')")
 
@@ -196,8 +195,7 @@ def test_a_compact_scene_has_places_to_focus_on(browser):
 
 def test_a_scene_that_is_too_large_for_webgpu_is_drawn_without(browser):
     init = "Object.defineProperty(GPUSupportedLimits.prototype, 'maxStorageBufferBindingSize', { get: () => 960 })"
-    with serve(random_scene(20), [facing()]) as server, open_gpu(browser, server, init=init) as page:
-        wait_for_frame(page)
+    with gpu_page_of(browser, random_scene(20), facing(), wait=wait_for_frame, of_page={"init": init}) as page:
         expected = (
             "WebGL 2 draws: the scene has 20 Gaussians, and WebGPU on this device can hold 10 of spherical harmonics "
             "of degree 3, or 17 with --compact. Footprints in grey need WebGPU."
@@ -210,8 +208,7 @@ def test_a_device_that_is_only_software_is_not_taken_unasked(browser):
         wait_for_frame(page)
         assert page.text_content("#renderer").startswith("WebGL 2 draws: WebGPU would have no graphics device here.")
         assert page.text_content("#note") == "moment:samples=4, drawn as box:samples=1"
-    with serve(random_scene(100), [facing()]) as server, open_gpu(browser, server) as page:
-        wait_for_frame(page)
+    with gpu_page_of(browser, random_scene(100), facing(), wait=wait_for_frame) as page:
         assert page.text_content("#renderer") == "WebGPU draws."
 
 
@@ -219,8 +216,7 @@ def test_a_device_that_is_only_software_is_not_taken_unasked(browser):
 def test_a_lost_device_comes_back_once_and_then_webgl_draws(browser):
     scene, view = random_scene(500), facing()
     lose = "() => { const lost = devices.at(-1); lost.destroy(); return lost.lost.then(() => null); }"
-    with serve(scene, [view], footprint="moment") as server, open_gpu(browser, server, init=DEVICES) as page:
-        wait_for_frame(page)
+    with gpu_page_of(browser, scene, view, wait=wait_for_frame, of_page={"init": DEVICES}, footprint="moment") as page:
         before = drawn(page, "moment:samples=4", view.width, view.height)
         assert_same(before, rendered(scene, view, "moment:samples=4"))
         page.evaluate(lose)
@@ -236,8 +232,7 @@ def test_a_lost_device_comes_back_once_and_then_webgl_draws(browser):
 def test_where_webgpu_fails_webgl_draws(browser):
     init = """
       GPUDevice.prototype.createComputePipelineAsync = async () => { throw new Error('A shader is refused.'); };"""
-    with serve(random_scene(100), [facing()]) as server, open_gpu(browser, server, init=init) as page:
-        wait_for_frame(page)
+    with gpu_page_of(browser, random_scene(100), facing(), wait=wait_for_frame, of_page={"init": init}) as page:
         expected = "WebGL 2 draws: WebGPU failed here. A shader is refused. Footprints in grey need WebGPU."
         assert page.text_content("#renderer") == expected
         assert page.is_hidden("#message")
@@ -277,19 +272,14 @@ def test_an_exported_file_draws_moment_without_network(browser, tmp_path):
 def controls(browser):
     """A page for a user who prefers no motion, so that journeys end at once."""
     scene, views = random_scene(300), [facing(), turned_view()]
-    with (
-        serve(scene, views, name="room.ply", footprint="moment") as server,
-        open_gpu(browser, server, reduced_motion="reduce") as page,
-    ):
-        wait_for_frame(page)
+    still = {"reduced_motion": "reduce"}
+    with gpu_page_of(browser, scene, views, "", wait_for_frame, still, name="room.ply", footprint="moment") as page:
         yield page
 
 
 def test_the_divider_and_the_heat_map_compare_any_two(controls):
-    image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-
     def picture():
-        return np.asarray(image.open(BytesIO(settle(controls))).convert("RGB"))[50:100]  # without names and controls
+        return screenshot(controls)[50:100]  # without names and controls
 
     controls.keyboard.press("h")
     moment = picture()
@@ -329,10 +319,9 @@ def test_what_the_screen_shows_is_the_picture(browser):
     view = replace(facing(), width=320, height=240, fx=300.0, fy=300.0)
     scene = random_scene(500)
     expected = rendered(scene, view, "moment:samples=4").clip(0, 1).transpose(1, 2, 0)
-    with serve(scene, [view], footprint="moment") as server, open_gpu(browser, server) as page:
-        wait_for_frame(page)
+    with gpu_page_of(browser, scene, view, wait=wait_for_frame, footprint="moment") as page:
         page.keyboard.press("h")
-        shown = np.asarray(image.open(BytesIO(settle(page))).convert("RGB"))
+        shown = screenshot(page)
         assert np.abs(shown - 255 * expected)[50:100].max() <= 1.5
         with page.expect_download() as download:
             page.keyboard.press("p")
