@@ -469,7 +469,7 @@ def test_errors_of_bake_are_one_line(files, capsys, extra, message):
 
 
 def test_version_and_help(capsys):
-    with pytest.raises(SystemExit, match="0"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         cli.main(["--version"])
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
 
@@ -484,7 +484,7 @@ def test_without_a_command_it_says_what_is_installed(capsys):
     assert "--help" in last
     for args in ([], ["render"], ["pareto"], ["inspect"]):
         args = [*args, "--help"]
-        with pytest.raises(SystemExit, match="0"):
+        with pytest.raises(SystemExit, match=r"^0$"):
             cli.main(args)
         text = capsys.readouterr().out
         assert text.startswith("usage: python -m analytic_rasterizer")

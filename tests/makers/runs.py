@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import torch
 
-from analytic_rasterizer.training import CaptureSource, Run, TrainingOptions
+from analytic_rasterizer.training import CaptureSource, Run, Trainer, TrainingOptions
 from analytic_rasterizer.training import rendering as g
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
@@ -42,3 +42,15 @@ def rows_shown(trainer) -> list[torch.Tensor]:
     with torch.no_grad():
         scene = trainer.scene().arguments()
         return [g.render(scene, s.settings, None, supersampling)[1] > 0 for s in trainer._next()]
+
+
+def around_steps(monkeypatch, before=lambda trainer: None, after=lambda trainer: None) -> None:
+    """Every step of a training is between before(trainer) and after(trainer)."""
+    step = Trainer.step
+
+    def watched(trainer):
+        before(trainer)
+        step(trainer)
+        after(trainer)
+
+    monkeypatch.setattr(Trainer, "step", watched)

@@ -518,15 +518,14 @@ def test_a_picture_that_breaks_during_a_training_ends_it_with_its_name(tmp_path)
 
 def test_interruption_ends_the_threads(synthetic, tmp_path, monkeypatch):
     run = runs.make_run(synthetic, tmp_path / "out", memory=PictureMemory(host=0), **SMALL)
-    step, seen = run.trainer.step, []
+    seen = []
 
-    def interrupted():
-        step()
+    def interrupted(trainer):
         seen.append(alive())
         if len(seen) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(run.trainer, "step", interrupted)
+    runs.around_steps(monkeypatch, after=interrupted)
     with pytest.raises(KeyboardInterrupt):
         run.train()
     assert all(seen) and not alive()

@@ -14,6 +14,7 @@ from capture_files import circle, write_colmap, write_nerf_synthetic, write_pict
 from commands import refused, words_of
 from places import ROOT
 from processes import run_python
+from runs import around_steps
 from train_extra import image
 
 from analytic_rasterizer import io, training
@@ -253,15 +254,14 @@ def test_what_is_complete_is_not_trained_again(blender, tmp_path, monkeypatch):
 
 def test_an_interrupted_table_goes_on_with_the_same_bits(blender, tmp_path, monkeypatch):
     run("blender-stst", blender, tmp_path / "whole", rows=["box"], iterations=6)
-    step, steps = training.Trainer.step, []
+    steps = []
 
     def interrupted(trainer):
         steps.append(trainer.progress.step)
         if len(steps) == 9:  # in the second scene
             signal.raise_signal(signal.SIGINT)
-        step(trainer)
 
-    monkeypatch.setattr(training.Trainer, "step", interrupted)
+    around_steps(monkeypatch, interrupted)
     said = []
     with pytest.raises(KeyboardInterrupt):
         run("blender-stst", blender, tmp_path / "part", rows=["box"], iterations=6, say=said.append)

@@ -23,7 +23,7 @@ from marks import needs_cuda
 from places import ROOT
 from ply_files import ply, vertices
 from processes import DEADLINE
-from runs import rows_shown, scatter
+from runs import around_steps, rows_shown, scatter
 from train_extra import image
 from training_step import TOLERANCE, check_next_step
 
@@ -614,14 +614,8 @@ def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsy
     """The step that runs is completed; the end is the same as without the interruption."""
     whole, part, small = tmp_path / "whole", tmp_path / "part", "--iterations 60 --random-points 50 --sh-degree 0"
     assert commands.train(synthetic, whole, small) == 0
-    step = training.Trainer.step
-
-    def interrupted(trainer):
-        if trainer.progress.step == 33:
-            signal.raise_signal(number)
-        step(trainer)
-
-    monkeypatch.setattr(training.Trainer, "step", interrupted)
+    at_33 = lambda trainer: trainer.progress.step == 33 and signal.raise_signal(number)  # noqa: E731
+    around_steps(monkeypatch, before=at_33)
     before = signal.getsignal(number)
     assert commands.train(synthetic, part, small) == 130
     assert signal.getsignal(number) is before
@@ -635,33 +629,23 @@ def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsy
     assert (whole / files.SCENE).read_bytes() == (part / files.SCENE).read_bytes()
 
 
-def signal_after_steps(run, monkeypatch, number, then=lambda: None) -> None:
-    step = run.trainer.step
-
-    def signalled():
-        step()
-        signal.raise_signal(number)
-        then()
-
-    monkeypatch.setattr(run.trainer, "step", signalled)
-
-
 def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
     run = make_run(synthetic, tmp_path)
-    signal_after_steps(run, monkeypatch, signal.SIGINT, lambda: signal.raise_signal(signal.SIGINT))
+    around_steps(monkeypatch, after=lambda trainer: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     with pytest.raises(KeyboardInterrupt):
         run.train()
 
 
 def test_a_second_sigterm_kills(synthetic, tmp_path, monkeypatch):
     run, handlers = make_run(synthetic, tmp_path, iterations=3), []
-    signal_after_steps(run, monkeypatch, signal.SIGTERM, lambda: handlers.append(signal.getsignal(signal.SIGTERM)))
+    look = lambda: handlers.append(signal.getsignal(signal.SIGTERM))  # noqa: E731
+    around_steps(monkeypatch, after=lambda trainer: (signal.raise_signal(signal.SIGTERM), look()))
     assert not run.train() and handlers == [signal.SIG_DFL]
 
 
 def test_a_handler_of_the_program_for_sigterm_stays(synthetic, tmp_path, monkeypatch):
     run, received = make_run(synthetic, tmp_path, iterations=3), []
-    signal_after_steps(run, monkeypatch, signal.SIGTERM)
+    around_steps(monkeypatch, after=lambda trainer: signal.raise_signal(signal.SIGTERM))
     before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
     try:
         assert run.train() and len(received) == 3

@@ -95,13 +95,8 @@ def test_the_log_grows_with_every_look(scene, tmp_path, monkeypatch):
     """Whatever happens to the process."""
     run, found = make_run(scene, tmp_path, iterations=250), {}
     (tmp_path / files.LOG).write_text('{"step": 7}\n')  # of another training
-    step = run.trainer.step
-
-    def watched():
-        found[run.progress.step] = [entry["step"] for entry in log_of(tmp_path)]
-        step()
-
-    monkeypatch.setattr(run.trainer, "step", watched)
+    steps_of_log = lambda: [entry["step"] for entry in log_of(tmp_path)]  # noqa: E731
+    runs.around_steps(monkeypatch, lambda trainer: found.update({trainer.progress.step: steps_of_log()}))
     run.train()
     assert found[9] == [] and found[99] == [10] and found[100] == [10, 100] and found[249] == [10, 100, 200]
     assert log_of(tmp_path) == run.history and run.history[-1]["step"] == 250
@@ -111,16 +106,15 @@ def test_a_resumed_log_goes_on_from_the_checkpoint(scene, tmp_path, monkeypatch)
     """What was logged after it happens once more."""
     run = make_run(scene, tmp_path, iterations=250)
     run.save_every = 120
-    step = run.trainer.step
 
-    def killed():
-        if run.progress.step == 210:
+    def kill(trainer):
+        if trainer.progress.step == 210:
             raise KeyboardInterrupt
-        step()
 
-    monkeypatch.setattr(run.trainer, "step", killed)
+    runs.around_steps(monkeypatch, kill)
     with pytest.raises(KeyboardInterrupt):
         run.train()
+    monkeypatch.undo()
     assert [entry["step"] for entry in log_of(tmp_path)] == [10, 100, 200]
     resumed = make_run(scene, tmp_path, resume=True)
     assert resumed.progress.step == 120
