@@ -51,13 +51,6 @@ def png_of_size(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def change_transforms(folder, change) -> None:
-    path = folder / "transforms_train.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 def nan_picture(folder) -> None:
     """A floating-point picture where the PNG was: Pillow tells formats by their content."""
     pixels = np.zeros((32, 32), np.float32)
@@ -76,7 +69,15 @@ def of_picture(change):
 
 
 def of_transforms(change):
-    return lambda folder: change_transforms(folder, change)
+    """A change of what the transforms file of the training says."""
+
+    def write(folder):
+        path = folder / "transforms_train.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return write
 
 
 BROKEN = {
@@ -614,8 +615,12 @@ def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsy
     """The step that runs is completed; the end is the same as without the interruption."""
     whole, part, small = tmp_path / "whole", tmp_path / "part", "--iterations 60 --random-points 50 --sh-degree 0"
     assert commands.train(synthetic, whole, small) == 0
-    at_33 = lambda trainer: trainer.progress.step == 33 and signal.raise_signal(number)  # noqa: E731
-    around_steps(monkeypatch, before=at_33)
+
+    def interrupt(trainer):
+        if trainer.progress.step == 33:
+            signal.raise_signal(number)
+
+    around_steps(monkeypatch, interrupt)
     before = signal.getsignal(number)
     assert commands.train(synthetic, part, small) == 130
     assert signal.getsignal(number) is before
@@ -638,8 +643,12 @@ def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
 
 def test_a_second_sigterm_kills(synthetic, tmp_path, monkeypatch):
     run, handlers = make_run(synthetic, tmp_path, iterations=3), []
-    look = lambda: handlers.append(signal.getsignal(signal.SIGTERM))  # noqa: E731
-    around_steps(monkeypatch, after=lambda trainer: (signal.raise_signal(signal.SIGTERM), look()))
+
+    def kill(trainer):
+        signal.raise_signal(signal.SIGTERM)
+        handlers.append(signal.getsignal(signal.SIGTERM))
+
+    around_steps(monkeypatch, after=kill)
     assert not run.train() and handlers == [signal.SIG_DFL]
 
 

@@ -95,8 +95,11 @@ def test_the_log_grows_with_every_look(scene, tmp_path, monkeypatch):
     """Whatever happens to the process."""
     run, found = make_run(scene, tmp_path, iterations=250), {}
     (tmp_path / files.LOG).write_text('{"step": 7}\n')  # of another training
-    steps_of_log = lambda: [entry["step"] for entry in log_of(tmp_path)]  # noqa: E731
-    runs.around_steps(monkeypatch, lambda trainer: found.update({trainer.progress.step: steps_of_log()}))
+
+    def look(trainer):
+        found[trainer.progress.step] = [entry["step"] for entry in log_of(tmp_path)]
+
+    runs.around_steps(monkeypatch, look)
     run.train()
     assert found[9] == [] and found[99] == [10] and found[100] == [10, 100] and found[249] == [10, 100, 200]
     assert log_of(tmp_path) == run.history and run.history[-1]["step"] == 250
