@@ -19,10 +19,6 @@ OTHERS = {"footprint": "box:samples=1", "scales": (2, 4), "scale_repeats": (3, 1
 OTHERS |= {"background": "white", "effects": "none", "exposure": "affine", "gradient_scales": "all", "sh_degree": 2}
 OTHERS |= {"prune_opacity": 0.25, "initial_opacity": 0.25, "densify_from": 0.25, "rates_from": 0.5}
 OTHERS |= {"ssim_weight": 0.5, "grow_share": 0.5, "densify_until": 0.5, "footprint_from": 0.5}
-OTHERS = {"footprint": "box:samples=1", "scales": (2, 4), "scale_repeats": (3, 1), "downsampling": "bicubic"}
-OTHERS |= {"background": "white", "effects": "none", "exposure": "affine", "gradient_scales": "all", "sh_degree": 2}
-OTHERS |= {"prune_opacity": 0.25, "initial_opacity": 0.25, "densify_from": 0.25, "rates_from": 0.5}
-OTHERS |= {"ssim_weight": 0.5, "grow_share": 0.5, "densify_until": 0.5, "footprint_from": 0.5}
 OTHERS |= {"first_footprint": "box:samples=1"}
 
 
