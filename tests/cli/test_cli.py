@@ -344,7 +344,8 @@ def test_interrupt_of_a_process_is_quiet(files):
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=DEADLINE)
     assert (process.returncode, out) == (130, "")
-    assert err.startswith("footprint point") and err.count("\n") == 1
+    choice, size = err.splitlines()
+    assert choice.startswith("footprint point") and size == "pictures of 512x384: 8 times of the 64x48 of the views"
     assert not (files / "out" / "2999.png").exists()
 
 
