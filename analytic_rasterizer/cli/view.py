@@ -66,29 +66,41 @@ def run(args) -> None:
             viewer.page_footprint(resolve_footprint(args.footprint))
         except viewer.PageFootprintError as error:
             raise ValueError(f"{error}; with --server every footprint can be shown") from None
+    asked_background = args.background
     found = io.find_scene(args.scene)
-    choice = found.choose_footprint(args.footprint)
-    footprint, reason = viewer.nearest_page_footprint(choice.footprint), choice.reason
-    if footprint != choice.footprint:
-        reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
     views, said = settle_views(args, found, required=False)
-    options = {"footprint": footprint, "background": args.background, "name": found.path.name}
-    options["compact"] = args.compact
-    packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
-    said.append(f"footprint {footprint}: {reason}")
+    packed, chosen = pack(args, found, views, args.background)
+    said.append(chosen)
     if args.export is not None:
         size = viewer.export_page(args.export, packed)
         say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
     photographs, told = find_photographs(found, views)
-    with viewer.start_server(packed, args.port or 0, photographs) as server:
+
+    def opens(path: Path):
+        """A file that is dropped on the page."""
+        dropped = io.find_scene(path)
+        background = asked_background or (dropped.background or (io.BLACK,))[0]
+        return pack(args, dropped, [], background)[0]
+
+    with viewer.start_server(packed, args.port or 0, photographs, opens) as server:
         say(*said, *told)
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             print()
+
+
+def pack(args, found: io.FoundScene, views: list[io.View], background) -> tuple[viewer.PackedScene, str]:
+    """What the page needs of a scene, and a line that says with which footprint it begins."""
+    choice = found.choose_footprint(args.footprint)
+    footprint, reason = viewer.nearest_page_footprint(choice.footprint), choice.reason
+    if footprint != choice.footprint:
+        reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
+    options = {"footprint": footprint, "background": background, "name": found.path.name, "compact": args.compact}
+    return viewer.pack_scene(io.load_scene(found.path), views, **options), f"footprint {footprint}: {reason}"
 
 
 def run_live(args) -> None:

@@ -23,6 +23,8 @@ MODULES = (
     "webgl.js",
     "renderers.js",
     "interface.js",
+    "drop.js",
+    "proof.js",
     "photograph.js",
     "address.js",
     "pace.js",

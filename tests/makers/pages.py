@@ -35,9 +35,11 @@ READ_PIXELS = """async () => {
 
 
 @contextmanager
-def serve(scene, views, photographs=None, **options):
+def serve(scene, views, photographs=None, opens=None, **options):
     """A server of the scene, in a thread of its own."""
-    with viewer.start_server(viewer.pack_scene(scene, views, **options), photographs=photographs) as server:
+    with viewer.start_server(
+        viewer.pack_scene(scene, views, **options), photographs=photographs, opens=opens
+    ) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         yield server

@@ -43,12 +43,14 @@ def server():
         thread.join()
 
 
-def ask(server, path, method="GET", host=None):
+def ask(server, path, method="GET", host=None, body=None):
     """(status, headers, body) of a request to the server, sent as it is."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=DEADLINE)
     connection.putrequest(method, path, skip_host=True)
     connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
-    connection.endheaders()
+    if body is not None:
+        connection.putheader("Content-Length", str(len(body)))
+    connection.endheaders(body)
     response = connection.getresponse()
     answer = response.status, dict(response.getheaders()), response.read()
     connection.close()
@@ -285,6 +287,32 @@ def test_an_address_without_its_last_slash_leads_to_the_page(server):
 def test_other_methods_are_refused(server):
     for method in ("POST", "PUT", "DELETE", "OPTIONS"):
         assert ask(server, f"/{server.token}/", method=method)[0] == 501
+
+
+def test_a_file_that_is_sent_is_shown_and_one_that_is_no_scene_is_refused(tmp_path):
+    """Whatever its name is, it stays in a folder of its own, which is gone afterwards."""
+    opened = []
+
+    def opens(path):
+        opened.append(path)
+        return viewer.pack_scene(io.load_scene(path), [], name=path.name)
+
+    io.save_scene(tmp_path / "scene.ply", make_scene())
+    content = (tmp_path / "scene.ply").read_bytes()
+    with viewer.start_server(viewer.pack_scene(make_scene()), opens=opens, photographs={0: lambda: b""}) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        told = ask(running, f"/{running.token}/open?name=..%2F..%2Fother%20one.ply", method="POST", body=content)
+        assert told[0] == 200
+        meta = json.loads(ask(running, f"/{running.token}/scene.json")[2])
+        assert meta["name"] == "other one.ply" and meta["photographs"] == []
+        refused = ask(running, f"/{running.token}/open?name=no.ply", method="POST", body=b"Dear diary")
+        assert refused[0] == 400 and refused[2].startswith(b"no.ply: ")
+        assert json.loads(ask(running, f"/{running.token}/scene.json")[2]) == meta
+        for path, status in ((f"/{running.token[:-1]}/open?name=a.ply", 403), (f"/{running.token}/a.ply", 501)):
+            assert ask(running, path, method="POST", body=content)[0] == status
+        assert [path.name for path in opened] == ["other one.ply", "no.ply"]
+        assert not any(path.parent.exists() for path in opened)
+        running.shutdown()
 
 
 def test_a_port_in_use_is_one_sentence(server):

@@ -207,7 +207,7 @@ def test_a_device_that_is_only_software_is_not_taken_unasked(browser):
     with serve(random_scene(100), [facing()], footprint="moment") as server, open_page(browser, server.url) as page:
         wait_for_frame(page)
         assert page.text_content("#renderer").startswith("WebGL 2 draws: WebGPU would have no graphics device here.")
-        assert page.text_content("#note") == "moment:samples=4, drawn as box:samples=1"
+        assert page.text_content("#drawn") == "Drawn: box:samples=1. WebGL 2 cannot draw moment:samples=4."
     with gpu_page_of(browser, random_scene(100), facing(), wait=wait_for_frame) as page:
         assert page.text_content("#renderer") == "WebGPU draws."
 
@@ -236,6 +236,54 @@ def test_where_webgpu_fails_webgl_draws(browser):
         expected = "WebGL 2 draws: WebGPU failed here. A shader is refused. Footprints in grey need WebGPU."
         assert page.text_content("#renderer") == expected
         assert page.is_hidden("#message")
+
+
+NOTHING_COMPUTED = "GPUComputePassEncoder.prototype.dispatchWorkgroups = () => {};"
+NOTHING_SHOWN = "GPURenderPassEncoder.prototype.draw = () => {};"
+
+
+@pytest.mark.gate
+@pytest.mark.parametrize(
+    "broken, why",
+    [(NOTHING_COMPUTED, "Its picture was empty where the scene is."), (NOTHING_SHOWN, "The page stayed black.")],
+)
+def test_where_webgpu_shows_black_webgl_draws(browser, broken, why):
+    """The commands are accepted, and do nothing: that is no error to the browser."""
+    scene = random_scene(200).with_activated(scales=torch.full((200, 3), 0.1))
+    with serve(scene, [facing()]) as server, open_gpu(browser, server, init=broken) as page:
+        wait_for_frame(page)
+        wait_for(page, "() => document.getElementById('renderer').textContent.startsWith('WebGL 2 draws: ')")
+        assert f"WebGPU failed here. {why}" in page.text_content("#renderer")
+        wait_for(page, "() => document.getElementById('loading').hidden")
+        assert page.is_hidden("#message")
+
+
+@pytest.mark.parametrize("scene", ["dark", "behind", "tiny"])
+def test_what_is_black_by_right_stays_with_webgpu(browser, scene):
+    made = random_scene(100).with_activated(scales=torch.full((100, 3), 1e-5 if scene == "tiny" else 0.1))
+    if scene == "dark":
+        made.shs[:] = 0
+        made.shs[:, 0] = -2.0
+    if scene == "behind":
+        made.means[:, 2] = -made.means[:, 2]
+    with serve(made, [facing()]) as server, open_gpu(browser, server) as page:
+        wait_for_frame(page)
+        settle(page)
+        assert page.text_content("#renderer") == "WebGPU draws."
+
+
+def test_the_page_says_that_shaders_compile(browser):
+    init = """
+      window.said = [];
+      new MutationObserver(() => {
+        const text = document.getElementById('loading-text')?.textContent;
+        if (text && said.at(-1) !== text) said.push(text);
+      }).observe(document, { subtree: true, childList: true, characterData: true });"""
+    with serve(random_scene(50), [facing()]) as server, open_gpu(browser, server, init=init) as page:
+        wait_for_frame(page)
+        said = page.evaluate("() => said")
+        assert "WebGPU compiles its shaders: 0%" in said and "WebGPU compiles its shaders: 100%" in said
+        assert page.is_hidden("#loading")
 
 
 def test_a_picture_whose_device_is_lost_is_drawn_again(browser):

@@ -11,7 +11,8 @@ const ARROW_STEP = 0.06;      // radians; with Shift, parts of the distance
 const WHEEL_STEP = 0.0015;    // logarithm of the distance, per px of scrolling
 const RADIANS_PER_PX = 0.006;
 // Where the controls would cover most of the scene, they are out of the way at first.
-const SMALL_TOUCH_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px)';
+const SMALL_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px), ' +
+  '(max-width: 240px), (max-height: 160px)';
 export const READING_TIME = 4;  // seconds that a message stays
 
 /// Colours of fields, '#rrggbb', and back.
@@ -22,8 +23,23 @@ export const rgbOf = hex => [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 
 export function showFailure(sentence) {
   element('failure').textContent = sentence;
   element('message').hidden = false;
+  hideProgress();
   announce('');
 }
+
+/// Shows what is awaited where the picture will be: its part that is done, from 0 to 1, or null where nobody knows.
+export function showProgress(text, part = null) {
+  const bar = element('loading-part');
+  element('loading').hidden = false;
+  if (element('loading-text').textContent !== text) element('loading-text').textContent = text;
+  if (part === null) bar.removeAttribute('value');
+  else bar.value = part;
+}
+
+export function hideProgress() { element('loading').hidden = true; }
+
+/// Resolves when what the page says now is on the screen.
+export const painted = () => new Promise(done => requestAnimationFrame(() => setTimeout(done)));
 
 let announcementEnds;
 
@@ -46,7 +62,7 @@ export class Interface {
     this.connectPointers();
     this.connectKeys();
     this.connectDivider();
-    if (matchMedia(SMALL_TOUCH_SCREEN).matches) this.toggleFolded();
+    if (matchMedia(SMALL_SCREEN).matches) this.toggleFolded();
     this.update();
   }
 
@@ -139,6 +155,11 @@ export class Interface {
 
   connectKeys() {
     window.addEventListener('keydown', event => {
+      if (event.key === '?' && element('help').open) {
+        element('help').close();
+        event.preventDefault();
+        return;
+      }
       // Fields and the dialog keep their keys, also a dialog that has just been closed; so do the browser's shortcuts.
       const inField = event.target instanceof Element && event.target.closest('select, input, dialog[open]');
       if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -257,12 +278,15 @@ export class Interface {
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
     element('label-left').textContent = this.inWords(footprint);
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
-    const names = comparing && !isPhotograph ? [footprint, compare] : [footprint];
-    const given = names.map(name => this.inWords(name)).filter((words, k) => words !== names[k]);
+    const names = comparing && !isPhotograph ? [footprint, compare] : [footprint], { renderer } = this.viewer;
+    const replaced = names.filter(name => !renderer.draws(this.viewer.footprint(name)));
+    element('drawn').textContent = replaced.map(
+      name => `Drawn: ${this.viewer.drawn(name).name}. ${renderer.name} cannot draw ${name}.`).join(' ');
+    element('drawn').hidden = replaced.length === 0;
     const { view, lens } = this.viewer.camera, has = this.viewer.meta.photographs.includes(view);
     const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
-    const notes = [...(isPhotograph && !besidePhotograph ? [missing] : []), given.join('; ')];
-    const note = [...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ').trim();
+    const notes = isPhotograph && !besidePhotograph ? [missing] : [];
+    const note = [...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ');
     element('note').textContent = note;
     element('note').hidden = note === '';
   }
@@ -274,11 +298,11 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows size and times of a frame. `rate` is null where the camera rests; `stages` are milliseconds by name.
-  showFigures(width, height, milliseconds, rate, stages) {
+  /// Shows what was drawn, the names of footprints, with size and times of a frame. `rate` is null where the camera rests; `stages` are milliseconds by name.
+  showFigures(drawn, width, height, milliseconds, rate, stages) {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
-    element('figures').textContent = `${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
+    element('figures').textContent = `${drawn.join(' | ')}, ${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
   }
 }

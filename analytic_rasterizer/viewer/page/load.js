@@ -12,7 +12,11 @@ export async function loadMeta() {
 
 /// {meta, geometry, harmonics}; `progress` is called with the part that has been read, from 0 to 1.
 export async function loadScene(meta, progress) {
-  if (isExported()) return sceneOf(meta, await unpack('geometry'), await unpack('harmonics'));
+  if (isExported()) {
+    const geometry = await unpack('geometry');
+    progress(0.5);
+    return sceneOf(meta, geometry, await unpack('harmonics'));
+  }
   const responses = await Promise.all([get('geometry.bin'), get('harmonics.bin')]);
   const total = sizeOf(responses[0]) + sizeOf(responses[1]);
   let done = 0;

@@ -1,6 +1,6 @@
 // Starts the viewer, or draws for a script: what the address says after the question mark, and the hooks for automation.
 
-import { announce, showFailure } from './interface.js';
+import { painted, showFailure, showProgress } from './interface.js';
 import { loadMeta, loadScene } from './load.js';
 import { Viewer } from './viewer.js';
 
@@ -47,15 +47,17 @@ function automation(given) {
 }
 
 async function main() {
-  announce('Loading the scene');
+  showProgress('Loading the scene');
   const given = new URLSearchParams(location.search);
   const viewer = new Viewer(await loadMeta(), given.get('renderer'));
   await viewer.open();  // what the device cannot hold is not loaded
-  await viewer.load(await loadScene(viewer.meta, part => announce(`Loading the scene: ${Math.round(100 * part)}%`)));
-  announce('');
+  const scene = await loadScene(viewer.meta, part => showProgress(`Loading the scene: ${Math.round(100 * part)}%`, part));
+  showProgress('Preparing to draw');
+  const asked = automation(given);
+  if (asked === null) await painted();  // drivers may be at work for long
+  await viewer.load(scene);
   window.analyticPixels = () => planes(viewer);
   window.analyticRender = (...view) => renderView(viewer, ...view);
-  const asked = automation(given);
   if (asked === null) {
     viewer.interact();
     return;

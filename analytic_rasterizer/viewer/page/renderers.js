@@ -12,6 +12,7 @@
 //   present({left, right, divider, difference, background})
 //                                shows `left`, from column `divider` of the canvas on `right`, or their difference
 //   read(name)                   rejects where there is no picture
+//   progress                     called, if it is there, with what takes long, how much of it is done, and of how much
 //   isLost; `lost` resolves when the device is lost, `returned` when it can be had again
 //   dispose()
 

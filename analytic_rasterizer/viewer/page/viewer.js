@@ -3,9 +3,11 @@
 import { readAddress, writeAddress } from './address.js';
 import { Camera, add, between, depthAt, times } from './camera.js';
 import { PHOTOGRAPH, parseFootprint } from './constants.js';
-import { Interface, READING_TIME, announce, showFailure } from './interface.js';
+import { acceptFiles } from './drop.js';
+import { Interface, READING_TIME, announce, hideProgress, showFailure, showProgress } from './interface.js';
 import { Pace } from './pace.js';
 import { Photographs } from './photograph.js';
+import { checkScreen } from './proof.js';
 import { openRenderer } from './renderers.js';
 import { WebGLRenderer } from './webgl.js';
 
@@ -40,6 +42,14 @@ export class Viewer {
   /// Opens a renderer for the scene, which is not here yet.
   async open() {
     Object.assign(this, await openRenderer(this.meta, this.wish));
+    this.renderer.progress = (what, done, of) => this.noteProgress(what, done, of);
+  }
+
+  /// Says what takes long: in place of a picture, as long as there is none; of another footprint's shaders below it.
+  noteProgress(what, done, of) {
+    if (!this.controls) return;
+    if (!this.shown) showProgress(`${what}: ${Math.round((100 * done) / of)}%`, done / of);
+    else if (what.includes('shaders')) announce(done < of ? what : '');
   }
 
   /// Takes the scene, which loadScene returned.
@@ -66,7 +76,8 @@ export class Viewer {
   }
 
   async recover(renderer, failure) {
-    announce('The graphics device was taken away; waiting for it to come back.');
+    announce(failure ? 'WebGPU failed here; WebGL 2 takes over.'
+      : 'The graphics device was taken away; waiting for it to come back.');
     if (!failure) await renderer.returned;
     renderer.dispose();
     this.shown = null;
@@ -91,6 +102,7 @@ export class Viewer {
   interact() {
     readAddress(this);
     this.controls = new Interface(this);
+    acceptFiles();
     new ResizeObserver(() => this.wake()).observe(this.surface);
     window.addEventListener('hashchange', () => {
       readAddress(this);
@@ -290,6 +302,7 @@ export class Viewer {
     const span = part => (split ? part : undefined), rest = span([Math.max(column - 1, 0), camera.width]);
     const pictures = [{ name: 'left', footprint: left, span: span([0, column]) }];
     if (right !== null) pictures.push({ name: 'right', footprint: right, span: rest });
+    if (!this.shown) showProgress(`${this.renderer.name} draws`);
     const start = performance.now(), cancelled = () => !moving && this.moving;
     if (!await this.renderer.draw({ camera, pictures, settled: !moving, cancelled })) return false;
     const took = performance.now() - start;
@@ -297,9 +310,20 @@ export class Viewer {
     else this.settledTime = took;
     let beside = right === null ? null : 'right';
     if (this.besidePhotograph && this.photographs.place(this.renderer, camera, this.camera)) beside = PHOTOGRAPH;
-    this.shown = { left: 'left', right: beside, camera, moving };
+    this.shown = { left: 'left', right: beside, camera, moving, drawn: pictures.map(({ footprint: { name } }) => name) };
     this.present();
+    if (!moving) await this.proveScreen(split ? column : camera.width);
+    hideProgress();
     return true;
+  }
+
+  /// Throws where WebGPU has shown nothing; asked of its first picture at rest, of which these columns were drawn.
+  async proveScreen(columns) {
+    const { renderer, shown } = this;
+    if (this.proved === renderer || renderer instanceof WebGLRenderer) return;
+    await checkScreen(renderer, this.scene.geometry, shown.camera, columns, this.state.background);
+    this.proved = renderer;
+    if (this.shown === shown) this.present();
   }
 
   /// The pace at which these footprints can follow the camera.
@@ -320,13 +344,13 @@ export class Viewer {
   }
 
   noteTime(start, active) {
-    const now = performance.now(), { width, height } = this.shown.camera;
+    const now = performance.now(), { drawn, camera: { width, height } } = this.shown;
     if (this.moving && this.lastDrawn) {
       const rate = 1000 / Math.max(now - this.lastDrawn, 1);
       this.rate = this.rate === null ? rate : 0.8 * this.rate + 0.2 * rate;
     }
     this.lastDrawn = active ? now : null;
-    this.controls.showFigures(width, height, now - start, this.rate, this.renderer.stages ?? {});
+    this.controls.showFigures(drawn, width, height, now - start, this.rate, this.renderer.stages ?? {});
   }
 
   /// Whether an error was that the device is lost, which may be told a little later.

@@ -43,6 +43,7 @@ export class WebGPURenderer {
     this.pairs = null;   // of the last picture
     this.stages = {};    // ms of the last frame, where the device tells
     this.turn = Promise.resolve();
+    this.progress = () => {};
     this.isLost = false;
     this.lost = device.lost.then(() => { this.isLost = true; });
     this.returned = Promise.resolve();
@@ -120,7 +121,8 @@ export class WebGPURenderer {
     for (;;) {
       const { steps, blended } = passes.steps(
         footprint, tilesOf(camera), region[2] - region[0], picture.ranges, picture.buffer);
-      await passes.pipelines.prepare([...steps, blended(top, rows)]);
+      await passes.pipelines.prepare(
+        [...steps, blended(top, rows)], (...parts) => this.progress('WebGPU compiles its shaders', ...parts));
       const frame = frameData(camera, footprint.variance, sampling(footprint).reach, region, passes.count, passes.room);
       device.queue.writeBuffer(passes.frame, 0, frame);
       const bands = this.bands(footprint, rows), start = performance.now();
@@ -174,6 +176,7 @@ export class WebGPURenderer {
     const height = Math.ceil((bottom - top) / bands), start = performance.now();
     for (let row = top; row < bottom; row += height) {
       if (cancelled()) return false;
+      this.progress('WebGPU draws', row - top, bottom - top);
       const encoder = this.device.createCommandEncoder();
       this.passes.encode(encoder, [blended(row, Math.min(height, bottom - row))]);
       this.device.queue.submit([encoder.finish()]);

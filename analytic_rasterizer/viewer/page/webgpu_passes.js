@@ -31,14 +31,18 @@ class Pipelines {
     this.groups = new Map();
   }
 
-  /// Compiles what these steps need. Rejects with the compiler's message.
-  async prepare(steps) {
+  /// Compiles what these steps need, and calls `note` with how many shaders are done and how many there are. Rejects
+  /// with the compiler's message.
+  async prepare(steps, note = () => {}) {
     const missing = new Map(steps.filter(({ key }) => !this.made.has(key)).map(step => [step.key, step]));
+    let done = 0;
+    if (missing.size > 0) note(0, missing.size);
     await Promise.all([...missing.values()].map(async ({ key, code }) => {
       const module = this.device.createShaderModule({ code: code(), label: key });
       this.made.set(key, await this.device.createComputePipelineAsync({
         layout: 'auto', compute: { module, entryPoint: 'main' }, label: key,
       }));
+      note(++done, missing.size);
     }));
   }
 
