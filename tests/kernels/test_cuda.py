@@ -83,10 +83,8 @@ def settings_for(variant, camera=CAMERA, device="cpu"):
 def with_channels(scene, settings, channels):
     """The scene with random channels in place of colours, and the settings with a background of as many."""
     g = torch.Generator().manual_seed(5)
-    colors = scenes.rand(g, len(scene["means3D"]), channels).float()
-    return scenes.without(scene, "shs") | {"colors_precomp": colors}, settings._replace(
-        bg=scenes.rand(g, channels).float()
-    )
+    scene = scenes.without(scene, "shs") | {"colors_precomp": scenes.rand(g, len(scene["means3D"]), channels).float()}
+    return scene, settings._replace(bg=scenes.rand(g, channels).float())
 
 
 def backward(color):

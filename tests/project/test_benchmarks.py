@@ -41,9 +41,11 @@ def imports_of_benchmarks(monkeypatch):
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """A function that runs a program, which ends with `code`, and returns what it printed; run.err is what it said."""
+    """A function that runs a program or the one of a name, which ends with `code`, and returns what it printed; run.err
+    is what it said."""
 
     def run(program, *arguments, code=None):
+        program = importlib.import_module(program) if isinstance(program, str) else program
         monkeypatch.setattr(sys, "argv", [f"{program.__name__}.py", *map(str, arguments)])
         assert program.main() == code
         out, run.err = capsys.readouterr()
@@ -115,10 +117,9 @@ def test_dialects(run):
 
 def test_speed(device, small_scene, run):
     """A row for every footprint, with numbers in all of its columns."""
-    speed = importlib.import_module("speed")
     footprints = ["box:samples=1", "mip", "mip@2"]
     options = ["--rounds", "1", "--queued", "--sh-degree", "2", "--threads", "1", "--device", device]
-    lines = run(speed, *files_of(small_scene), *options, "--footprints", *footprints).splitlines()
+    lines = run("speed", *files_of(small_scene), *options, "--footprints", *footprints).splitlines()
     assert "50 Gaussians of SH degree 2, 2 views of 40x30" in lines[0]
     assert [line.split()[0] for line in lines[2:5]] == footprints
     found = written(small_scene)
@@ -211,11 +212,10 @@ def add_peers(monkeypatch):
 
 def test_speed_against(device, small_scene, monkeypatch, run):
     """A row for every peer that is there, whose picture is ours of the same footprint; the others are named."""
-    speed = importlib.import_module("speed")
     calls = add_peers(monkeypatch)
     names = ["gsplat", "gsplat_antialiased", "official", "module:official=mip", "not_there"]
     options = ["--rounds", "1", "--threads", "1", "--device", device, "--footprints", "box:samples=1"]
-    lines = run(speed, *files_of(small_scene), *options, "--against", ",".join(names)).splitlines()
+    lines = run("speed", *files_of(small_scene), *options, "--against", ",".join(names)).splitlines()
     assert lines[0].startswith("not_there: left out, for it is not installed")
     assert [line.split()[0] for line in lines[3:8]] == ["box:samples=1", *names[:-1]]
     results = written(small_scene)["results"]
@@ -266,12 +266,11 @@ def test_peers_that_need_cuda_are_left_out_without(small_scene, monkeypatch, cap
 
 def test_table(device, small_scene, monkeypatch, capsys, run):
     """A column for every scene, a row for every footprint and peer."""
-    table = importlib.import_module("table")
     add_peers(monkeypatch)
     columns = [f"{label}={small_scene}/scene.npz,{small_scene}/views.json" for label in ("first", "second one")]
     options = ["--rounds", "1", "--threads", "1", "--device", device, "--against", "official"]
     arguments = [*columns, *options, "--footprints", "mip", "analytic", "--json", str(small_scene / "out.json")]
-    lines = run(table, *arguments).splitlines()
+    lines = run("table", *arguments).splitlines()
     results = written(small_scene)["results"]
     assert lines[2] == "| forward / forward + backward, ms | first | second one |"
     for line, name in zip(lines[4:7], ("mip", "analytic", "official"), strict=True):
@@ -283,7 +282,7 @@ def test_table(device, small_scene, monkeypatch, capsys, run):
         assert cells == [name, *expected]
     assert lines[7] == "first, official: mean absolute difference from our picture 0"
     with pytest.raises(SystemExit):
-        run(table, "scene.npz")
+        run("table", "scene.npz")
     assert "must be LABEL=SCENE,VIEWS, got scene.npz" in capsys.readouterr().err
 
 
@@ -291,7 +290,7 @@ def run_scaling(run, device, folder, *options):
     """What scaling.py prints and writes for 100 and 400 Gaussians and for three sizes."""
     given = ["--gaussians", "1e2,4e2", "--size", "96x64", "--sizes", "48x32,96x64,192x128", "--rounds", "1"]
     given += ["--density", "0.05", "--count", "200", "--device", device, "--json", folder / "out.json", *options]
-    return run(importlib.import_module("scaling"), *given), written(folder)
+    return run("scaling", *given), written(folder)
 
 
 def test_scaling(device, tmp_path, run):
@@ -372,9 +371,8 @@ def test_synthetic_splats_keep_their_size():
 
 def test_losses(device, tmp_path, run):
     """Every row, with a time in all of its columns."""
-    losses = importlib.import_module("losses")
     options = ["--sizes", "20x10", "--gaussians", "30", "--rounds", "1", "--threads", "1", "--device", device]
-    table = run(losses, *options, "--json", str(tmp_path / "out.json"))
+    table = run("losses", *options, "--json", str(tmp_path / "out.json"))
     results = written(tmp_path)["results"]
     assert len(results) == 11
     for name, result in results.items():
@@ -415,43 +413,41 @@ def test_training(device, tmp_path, run):
     """A row for every variant, and a run for every variant and seed."""
     pytest.importorskip("PIL.Image", reason="needs the train extra")
     pytest.importorskip("scipy", reason="needs the train extra")
-    training = importlib.import_module("training")
     write_nerf_synthetic(tmp_path, circle(2, (16, 16)), circle(2, (16, 16)))
     (tmp_path / "more.json").write_text(json.dumps({"mine": {"scale_repeats": [3, 1, 1, 1], "density": "mcmc"}}))
     arguments = [tmp_path, "--more", tmp_path / "more.json", "--json", tmp_path / "out.json", "--device", device]
     names = ["default", "mine", "3dgs"]
     options = ["--variants", *names, "--seeds", "0", "1", "--scales", "1,2", "--iterations", "12"]
-    lines = run(training, *arguments, *options, "--random-points", "20", code=0).splitlines()
+    lines = run("training", *arguments, *options, "--random-points", "20", code=0).splitlines()
     assert [line.split()[0] for line in lines[2:]] == names and all("±" in line for line in lines[2:])
     runs = written(tmp_path)["runs"]
     assert [(run["variant"], run["seed"]) for run in runs] == [(v, s) for s in (0, 1) for v in names]
     assert all(run["steps"] == 12 and math.isfinite(run["test"]["mean"]["psnr"]) for run in runs)
     assert runs[1]["options"]["scale_repeats"] == [3, 1]
     assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([1, 1], "3dgs")
-    run(training, tmp_path, "--variants", "none", code=2)
+    run("training", tmp_path, "--variants", "none", code=2)
     (tmp_path / "transforms_test.json").unlink()
-    run(training, tmp_path, code=2)  # before anything is trained
+    run("training", tmp_path, code=2)  # before anything is trained
     assert run.err == f"error: {tmp_path}: there are no test pictures\n"
 
 
 def test_gsplat_training(tmp_path, monkeypatch, run):
     """Its strategy grows Gaussians from our call, and the error of the pictures falls; what is missing is said."""
-    program = importlib.import_module("gsplat_training")
     arguments = [tmp_path, "--device", "cpu", "--random-points", "300", "--json", tmp_path / "out.json"]
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "gsplat", None)
-        run(program, *arguments, code=2)
+        run("gsplat_training", *arguments, code=2)
     assert run.err.startswith("error: gsplat, whose strategy this runs, is not installed")
     pytest.importorskip("gsplat", reason="needs gsplat")
     pytest.importorskip("PIL.Image", reason="needs the train extra")
     pytest.importorskip("scipy", reason="needs the train extra")
-    run(program, *arguments, "--rasterizer", "gsplat", code=2)
+    run("gsplat_training", *arguments, "--rasterizer", "gsplat", code=2)
     assert run.err == "error: --rasterizer gsplat: needs CUDA\n"
     write_nerf_synthetic(tmp_path, circle(3), circle(2))
     found = {}
     for steps, options in ((1, []), (60, []), (20, ["--packed", "--absgrad", "--antialiased"])):
         options = [*options, "--iterations", steps, "--refine-start", "5", "--refine-every", "10"]
-        [header, row] = run(program, *arguments, *options, code=0).splitlines()[1:]
+        [header, row] = run("gsplat_training", *arguments, *options, code=0).splitlines()[1:]
         assert header.split()[:4] == ["rasterizer", "seconds", "PSNR", "Gaussians"] and row.split()[0] == "ours"
         found[steps] = written(tmp_path)["runs"]["ours"]
     assert found[60]["psnr"] > found[1]["psnr"] and found[60]["gaussians"] != found[1]["gaussians"] == 300
