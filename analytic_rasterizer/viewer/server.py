@@ -137,10 +137,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return
         self._send(200, b"", "text/plain; charset=utf-8", True)
 
-    def _receive(self, path: Path) -> None:
+    def _receive(self, temporary: Path) -> None:
         """Writes what is sent into a file. Raises OSError where there is no room, or the connection ends."""
         left = int(self.headers.get("Content-Length") or 0)
-        with path.open("wb") as file:
+        with temporary.open("wb") as file:
             while left > 0:
                 part = self.rfile.read(min(left, CHUNK))
                 if not part:
