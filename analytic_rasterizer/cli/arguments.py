@@ -10,7 +10,7 @@ import re
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from io import StringIO
 from pathlib import Path
 
@@ -18,7 +18,9 @@ import torch
 
 from .. import _C
 from ..filters import PIXEL_VARIANCE
+from ..io.errors import SceneError, SceneWarning
 from ..io.images import BACKGROUNDS
+from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.files import results_folder
 from .launch import report
 
@@ -29,6 +31,7 @@ USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, Memory
 VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
 LARGER = "larger numbers in --scales make them smaller"
 ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF")
+KNOWN_OPTIONS = "known_options"  # of parsed arguments: what messages may advise
 MOST_NAMES = 3  # that may have been meant
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 """What `--help` shows for a value, by its type."""
@@ -57,7 +60,10 @@ class Parser(argparse.ArgumentParser):
         if unknown:  # before what argparse says of an option that is required, and here has another name
             near = dict.fromkeys(name for option in unknown for name in self._near_options(option))
             self.error(f"unrecognized arguments: {' '.join(unknown)}{_did_you_mean(near)}")
-        return super().parse_known_args(args, namespace)
+        parsed, rest = super().parse_known_args(args, namespace)
+        if not hasattr(parsed, KNOWN_OPTIONS):  # a command's, which has its own parser, are there already
+            setattr(parsed, KNOWN_OPTIONS, frozenset(self._option_string_actions))
+        return parsed, rest
 
     def _unknown_options(self, args: list[str]) -> list[str]:
         """The names among the arguments that no option of this parser has; those after a command are the command's."""
@@ -135,26 +141,32 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
     """
     if sys.stderr is None:  # closed, as for a service: without a place, print takes stdout, and libraries fail
         sys.stderr = StringIO()
-    usual = warnings.formatwarning
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    usual, options = warnings.formatwarning, frozenset()
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {_told(message, options)}\n"
     try:
         args = parse()
+        options = getattr(args, KNOWN_OPTIONS, options)
         args.run(args)
         return 0
     except KeyboardInterrupt:
         return 130
     except USER_ERRORS as error:
-        report(_describe(error))
+        report(_describe(error, options))
         return 2
     finally:
         warnings.formatwarning = usual
 
 
-def _describe(error: BaseException) -> str:
-    """The error in one line."""
+def _told(said: object, options: Collection[str]) -> str:
+    """The text of an error or a warning, with the advice that a command with these options can follow."""
+    return said.told(options) if isinstance(said, (SceneError, SceneWarning)) else str(said)
+
+
+def _describe(error: BaseException, options: Collection[str]) -> str:
+    """The error in one line, for a command with these options."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return str(error).partition("\n")[0] or type(error).__name__
+    return _told(error, options).partition("\n")[0] or type(error).__name__
 
 
 def add_scene(parser) -> None:
@@ -180,6 +192,30 @@ def add_footprint(
 ) -> None:
     """--footprint, and where it comes from otherwise."""
     parser.add_argument("--footprint", metavar="NAME[:k=v,..]", help=f"{text} {default}")
+
+
+def add_reading(parser, folder: str, training: str = "") -> None:
+    """How a capture is read, see `training.load_capture`. What is not given is None.
+
+    Args:
+        folder: What the help calls the capture.
+        training: What comes before the usual, in the help of defaults.
+    """
+    add = parser.add_argument
+    images = f"folder in {folder} of a reconstruction's photographs (default: {training}{IMAGES})"
+    add("--images", metavar="NAME", help=images)
+    test_every = f"where {folder} does not say: keep every N-th photograph for the test; 0: none"
+    add("--test-every", type=int, metavar="N", help=f"{test_every} (default: {training}{TEST_PERIOD})")
+    cameras = f"file or folder in {folder} to read the cameras from, such as transforms.json or sparse/1"
+    add("--cameras", metavar="NAME", help=f"{cameras} (default: {training}found)")
+    choices = {
+        "lens": "photographs with a lens are rendered with it, resampled to pinholes, or an error",
+        "missing": "pictures and masks that cannot be read are an error, or left out: without its picture a camera too",
+        "masks": "black pixels of masks do not count, or masks are ignored",
+        "alpha": "a background is seen through transparent pixels, or they do not count",
+    }
+    for name, text in choices.items():
+        add(f"--{name}", choices=CHOICES[name], help=f"{text} (default: {training}{CHOICES[name][0]})")
 
 
 def add_view_options(parser) -> None:

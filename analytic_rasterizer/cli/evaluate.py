@@ -21,21 +21,22 @@ from ..training import (
     load_pictures,
     save_pictures,
 )
-from ..training.captures import IMAGES, TEST_PERIOD, Capture
+from ..training.captures import IMAGES, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES, about_correction, measured_in_words
 from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.parts import check_scales
+from ..training.source import READING
 from ..training.start import background_of
 from ..training.store import processes_here
 from .arguments import (
     add_machine_options,
+    add_reading,
     add_scales,
     color,
     count,
     use_expandable_segments,
     use_machine,
-    whole_number,
     whole_numbers,
     writable_folder,
 )
@@ -59,11 +60,7 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder that `train` wrote, file of a scene, or folder of a model of 3DGS")
     add("--data", metavar="FOLDER", help="the capture (default: that of the training, where options.json names it)")
-    add(
-        "--images", metavar="NAME", help=f"folder in it of the photographs (default: that of the training, or {IMAGES})"
-    )
-    test_every = f"where the capture does not say: test with every N-th (default: as the training, or {TEST_PERIOD})"
-    add("--test-every", type=whole_number, metavar="N", help=test_every)
+    add_reading(parser, "FOLDER", "as the training, or ")
     out = "folder for the results (default: SCENE where it is a folder, otherwise NAME_evaluation beside it)"
     add("--out", metavar="DIR", help=out)
     add("--footprint", nargs="+", dest="footprints", metavar="NAME[:k=v]", help="(default: that of the training)")
@@ -118,7 +115,7 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
         named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
         images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
         source, options, scales = CaptureSource(args.data, images), None, scales_of(cfg_args, args.images or images)
-    given = {"folder": args.data, "images": args.images, "test_every": args.test_every}
+    given = {"folder": args.data} | {name: getattr(args, name) for name in READING}
     source = replace(source, **{name: value for name, value in given.items() if value is not None})
     return Protocol(source.settled(), tuple(dict.fromkeys(args.scales or scales)), options)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
-from ..io import FoundScene, View, to_image
+from ..io import FoundScene, SceneError, View, to_image
 from ..training.captures import Photograph
 from ..training.options import TrainingOptions
 from ..training.pictures import load_pictures
@@ -27,7 +27,8 @@ def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Ca
         options = TrainingOptions.from_dict(found.training.options)
         capture = source.load_photographs()  # in world coordinates: views are known by their names
     except (OSError, ValueError, KeyError, TypeError, ImportError) as error:
-        return {}, [f"no photographs: {error}"]
+        # No option of `view` says how a capture is read.
+        return {}, [f"no photographs: {error.told(()) if isinstance(error, SceneError) else error}"]
     items = {item.view.name: item for item in (*capture.train, *capture.test)}
     background = (found.background or (capture.background, ""))[0]
 

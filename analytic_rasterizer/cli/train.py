@@ -14,13 +14,20 @@ from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
-from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
 from ..training.reports import process_age
 from ..training.source import READING
-from .arguments import METAVARS, add_machine_options, port, use_expandable_segments, use_machine, whole_numbers
+from .arguments import (
+    METAVARS,
+    add_machine_options,
+    add_reading,
+    port,
+    use_expandable_segments,
+    use_machine,
+    whole_numbers,
+)
 from .launch import add_rank_options, is_launched, ranks_of
 
 TIMES_TEXT = "T is a time: a number of steps, or up to 1 a share of the training. See docs/training.md"
@@ -38,20 +45,7 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")
     add("--out", required=True, metavar="DIR", help="folder for the results")
-    images = f"folder in SCENE of a reconstruction's photographs (default: {IMAGES})"
-    add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
-    test_every = f"where SCENE does not say: keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
-    add("--test-every", type=int, metavar="N", help=test_every)
-    cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
-    add("--cameras", metavar="NAME", help=cameras)
-    choices = {
-        "lens": "photographs with a lens are rendered with it, resampled to pinholes, or an error",
-        "missing": "pictures that are not there are an error, or left out with their cameras",
-        "masks": "black pixels of masks do not count, or masks are ignored",
-        "alpha": "a background is seen through transparent pixels, or they do not count",
-    }
-    for name, text in choices.items():
-        add(f"--{name}", choices=CHOICES[name], help=f"{text} (default: {CHOICES[name][0]})")
+    add_reading(parser, "SCENE")  # what is not given is None, for --resume
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)

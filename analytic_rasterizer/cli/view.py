@@ -12,6 +12,7 @@ from .arguments import (
     add_footprint,
     add_machine_options,
     add_view_options,
+    check_writable_file,
     port,
     use_expandable_segments,
     use_machine,
@@ -59,6 +60,8 @@ def run(args) -> None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
     if args.export is not None and Path(args.export).suffix.lower() != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
+    if args.export is not None:
+        check_writable_file(args.export)
     if args.export is not None and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")
     if args.footprint is not None:  # raises before the scene is read

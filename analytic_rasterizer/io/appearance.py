@@ -156,7 +156,8 @@ class FoundScene:
         """
         if path is None and self.cameras is None:
             where = self.path.parent if self.model is None else self.model
-            raise SceneError(f"{self.path}: no views: there is no {CAMERAS} in {where}; give a file of views (--views)")
+            lacking = f"{self.path}: no views: there is no {CAMERAS} in {where}"
+            raise SceneError(lacking, "give a file of views (--views)")
         views = load_views(self.cameras if path is None else path, size)
         if self.path.suffix.lower() != ".splat":  # which holds no offset, and is beside views of its own frame
             views = [view.in_frame(self.metadata.offset) for view in views]

@@ -1,14 +1,76 @@
-"""What readers raise: of broken files, and of libraries that are missing."""
+"""What readers say of files that cannot be right, and of libraries that are missing.
+
+A reader that cannot use a file raises SceneError, and one that has a doubt warns of it with SceneWarning. Either says
+which file, what was expected, what was found, and as advice what to do. Advice may name an option of commands; a
+command leaves out the advice that names an option which it does not have (`told`).
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+import re
+import warnings
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+POINTER = b"version https://git-lfs"  # how a pointer of Git LFS begins
 
 
-class SceneError(ValueError):
-    """A scene or views file that cannot be used; the message names the file and what is wrong."""
+class _Advised:
+    """A message with advice.
+
+    Args:
+        message: Which file, what was expected, and what was found.
+        *advice: What to do: "--missing skip leaves them out".
+    """
+
+    def __init__(self, message: str, *advice: str):
+        super().__init__("; ".join((message, *advice)))
+        self.message, self.advice = message, advice
+
+    def told(self, options: Collection[str]) -> str:
+        """The text for a command that has these options: without advice that names another one."""
+        return "; ".join((self.message, *(text for text in self.advice if set(OPTION.findall(text)) <= set(options))))
+
+
+class SceneError(_Advised, ValueError):
+    """A file that cannot be used. The message names the file and what is wrong."""
+
+    @classmethod
+    def of(cls, where, expected: str, got, *advice: str) -> SceneError:
+        """The error of a file or a part of it, `where`: what was `expected`, what it has `got`, and `advice`."""
+        return cls(f"{where}: expected {expected}, got {got}", *advice)
+
+    def within(self, where) -> SceneError:
+        """The same, with `where` it was in front."""
+        return SceneError(f"{where}: {self.message}", *self.advice)
+
+
+class SceneWarning(_Advised, UserWarning):
+    """Of a file that can be used, and may not be what was meant."""
+
+
+def warn_of(where, text: str, *advice: str, stacklevel: int = 1) -> None:
+    """Warns of a file or a part of it, `where`; `stacklevel` counts from the caller."""
+    warnings.warn(SceneWarning(f"{where}: {text}", *advice), stacklevel=stacklevel + 1)
+
+
+def counted_files(bad: Sequence[Path], count: int, what: str, problem: str) -> str:
+    """That some of so many files have a problem: "2 of 9 pictures are missing, the first is images/a.png"."""
+    return f"{len(bad)} of {count} {what} {problem}, the first is {bad[0]}"
+
+
+def check_content(path) -> None:
+    """Raises SceneError for a pointer of Git LFS that stands for a file. Whether there is a file is not looked at."""
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(len(POINTER))
+    except OSError:
+        return  # which who reads the file says
+    if start == POINTER:
+        raise SceneError.of(path, "the content of the file", "a pointer of Git LFS", "`git lfs pull` fetches it")
 
 
 @contextmanager
@@ -17,7 +79,7 @@ def naming(path) -> Iterator[None]:
     try:
         yield
     except SceneError as error:
-        raise SceneError(f"{path}: {error}") from None
+        raise error.within(path) from None
 
 
 @contextmanager

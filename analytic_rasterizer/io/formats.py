@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .errors import SceneError
+from .errors import SceneError, check_content
 
 FORMATS = {
     ".ply": "ply",
@@ -33,4 +33,5 @@ def scene_file(path) -> tuple[Path, str]:
         raise SceneError(
             f"{path}: expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got {path.suffix or 'no suffix'!r}"
         )
+    check_content(path)
     return path, FORMATS[suffix]

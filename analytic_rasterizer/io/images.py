@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from .errors import SceneError, first_line, optional_import
+from .errors import SceneError, check_content, first_line, optional_import
 
 BLACK = (0.0, 0.0, 0.0)
 """(r, g, b) of a background."""
@@ -57,4 +57,5 @@ def opened_picture(path: Path, extra: str = "cli") -> Iterator[Any]:
             yield opened
     # Pillow raises any of these for broken files, and an error of its own for pictures of more than 178 megapixels.
     except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
+        check_content(path)
         raise SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None

@@ -81,7 +81,7 @@ def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
     Raises SceneError, which begins with `where`.
     """
     said = {name: entry[name] for name in (*_COEFFICIENTS, *_OTHER_WORDS) if _says_something(entry.get(name))}
-    model = entry.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") is True else "OPENCV")
+    model = model_name(entry) or ("OPENCV_FISHEYE" if said.get("is_fisheye") is True else "OPENCV")
     if model == "OPENCV_FISHEYE":
         said.pop("is_fisheye", None)
     if model == SPHERICAL:
@@ -110,6 +110,12 @@ def lens_of_transforms(entry: Mapping[str, Any], where: str) -> Lens | None:
         raise SceneError(f"{where}: camera_model {model} is not one of nerfstudio's")
     radial, tangential = ([said.get(name, 0.0) for name in _COEFFICIENTS[part]] for part in (slice(6), slice(6, 8)))
     return _made(lambda: Lens.perspective(radial, tangential), where)
+
+
+def model_name(entry: Mapping[str, Any]) -> Any:
+    """The camera_model of an entry, in capitals; None where there is none."""
+    model = entry.get("camera_model")
+    return model.upper() if isinstance(model, str) else model
 
 
 def _says_something(value) -> bool:

@@ -83,7 +83,7 @@ class SceneMetadata:
         lost = []
         if self.antialiased:
             chosen = self.footprint or COMPENSATED
-            lost.append(f"the footprint (give --footprint {chosen} where it is rendered)")
+            lost.append(f"the footprint (`render --footprint {chosen}` shows it)")
         if self.offset is not None and any(self.offset):
             lost.append(f"the offset {self.offset} of its positions")
         if self.background is not None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .errors import SceneError, naming
+from .errors import SceneError, check_content, naming
 
 # NumPy's codes of the types, which have two names each.
 TYPES = {
@@ -65,6 +65,7 @@ class Header(NamedTuple):
 
 def read_header(path) -> Header:
     """The header of a .ply. Raises SceneError, which names the file, where it is none, and OSError."""
+    check_content(path)
     with Path(path).open("rb") as file:
         start = file.read(HEADER_LIMIT)
     with naming(path):
@@ -186,6 +187,7 @@ def read_rows(path, names: Sequence[str]) -> tuple[Header, dict[str, Rows]]:
         SceneError: The file is no .ply, or it is cut short, or a number cannot be read. The message names the file.
         OSError: The file cannot be read.
     """
+    check_content(path)
     content = Path(path).read_bytes()
     with naming(path):
         header = parse_header(content[:HEADER_LIMIT])

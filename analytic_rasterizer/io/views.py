@@ -12,11 +12,13 @@ from typing import Any
 import torch
 
 from ..cameras.camera import View
-from .errors import SceneError, first_line
+from .errors import SceneError, check_content, first_line
 from .images import opened_picture
-from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, sphere_of
+from .lenses import SPHERICAL, lens_from_json, lens_of_transforms, lens_to_json, model_name, sphere_of
 from .pictures import PictureFiles
 from .writing import write_json, write_text
+
+SIZE, FOCAL = {"w", "h"}, {"fl_x", "camera_angle_x"}  # of an entry of a transforms file
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
@@ -25,14 +27,14 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
     - 3DGS `cameras.json`: a list of {id, img_name, width, height, position, rotation, fx, fy} with
       the camera-to-world rotation;
     - Blender or nerfstudio `transforms.json`: {frames: [{file_path, transform_matrix}]}, camera to
-      world with OpenGL axes; camera_angle_x, or fl_x with fl_y, cx, cy, w, h, globally or by frame;
+      world with OpenGL axes; camera_angle_x, or fl_x with fl_y, cx, cy, or the matrix K; w, h; globally or by frame;
     - a list of {width, height, fx, fy, w2c} with w2c world-to-camera, 16 numbers by rows or 4 x 4.
 
     cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2). The first and the last may
     have `offset`, which positions are relative to, see `View`, and `lens`: {model, coefficients}, as of `Lens`. The
     second may have a lens by camera_model and k1, k2, ... as nerfstudio has, globally or by frame. Views of a
-    transforms file that states no image size
-    have `size` = (width, height), or that of their pictures; where a picture is missing, that of the first that exists.
+    transforms file that states no image size have `size` = (width, height), or that of their pictures; where a picture
+    is missing, that of the first that exists.
 
     Raises:
         SceneError: Something is missing, malformed, not finite or not positive, or the list is empty. The message names
@@ -44,6 +46,7 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
 def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], Any]:
     """What `load_views` returns, with the content of the file. Raises as that does."""
     path = Path(path)
+    check_content(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -53,7 +56,7 @@ def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], A
     try:
         views = _views(data, path.parent, size)
     except SceneError as error:
-        raise SceneError(f"{path}: {error}") from None
+        raise error.within(path) from None
     return with_distinct_names(views), data
 
 
@@ -88,7 +91,7 @@ def _views(data, folder: Path, size) -> list[View]:
     if isinstance(data, dict) and "frames" in data:
         frames = _entries(data["frames"], "frames")
         sizes = [size] * len(frames)
-        if size is None and not any("w" in frame for frame in [data, *frames]):
+        if size is None and not SIZE & data.keys():
             sizes = _picture_sizes(folder, frames)
         return [_transforms_view(i, frame, data, size) for i, (frame, size) in enumerate(zip(frames, sizes))]
     if not isinstance(data, list):
@@ -137,6 +140,8 @@ def _listed_view(i: int, entry: dict) -> View:
 def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
     where = f"frame {i}"
     entry = shared | frame  # a frame's own intrinsics go before the shared ones
+    if "fl_x" not in frame and ("K" in frame or ("K" in shared and not FOCAL & entry.keys())):
+        entry |= _of_matrix(entry["K"], f"{where}: K")
     lens = lens_of_transforms(entry, where)
     if "w" in entry or "h" in entry:
         width = checked_pixels(_get(entry, "w", where), f"{where}: w")
@@ -145,15 +150,15 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
         width, height = (checked_pixels(number, "size") for number in size)
     else:
         raise SceneError(
-            f"{where}: no image size: expected 'w' and 'h', a picture at 'file_path', "
-            "or a size given by the caller (--size)"
+            f"{where}: no image size: expected 'w' and 'h', a picture at 'file_path', or a size given by the caller",
+            "--size W H gives it",
         )
-    if entry.get("camera_model") == SPHERICAL:
+    if model_name(entry) == SPHERICAL:
         intrinsics = sphere_of(width, height)
     else:
         fx = _focal(entry, "fl_x", "camera_angle_x", width, where)
         if fx is None:
-            raise SceneError(f"{where}: expected 'fl_x' or 'camera_angle_x'")
+            raise SceneError(f"{where}: expected 'fl_x', 'camera_angle_x' or 'K'")
         fy = _focal(entry, "fl_y", "camera_angle_y", height, where)
         intrinsics = {"fx": fx, "fy": fx if fy is None else fy}
         intrinsics |= {name: _optional(entry, name, where) for name in ("cx", "cy")}
@@ -170,6 +175,15 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
     )
 
 
+def _of_matrix(value, where: str) -> dict[str, float]:
+    """fl_x, fl_y, cx and cy of a matrix K, px, by rows or 9 numbers. Raises SceneError, which begins with `where`."""
+    flat = isinstance(value, list) and len(value) == 9
+    (fx, skew, cx), (below, fy, cy), last = _numbers(value, (9,) if flat else (3, 3), where).reshape(3, 3).tolist()
+    if skew or below or last != [0, 0, 1]:
+        raise SceneError(f"{where} must be fx 0 cx, 0 fy cy, 0 0 1 by rows, got {_shorten(value)}")
+    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+
+
 def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> float | None:
     """Focal length in pixels, from itself or from the angle that `extent` pixels span."""
     if length in entry:
@@ -183,9 +197,10 @@ def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> flo
 
 
 def _picture_sizes(folder: Path, frames: list[dict]) -> list[tuple[int, int] | None]:
-    """Sizes of the pictures that the frames name; of those that do not exist, that of the first that does, or None."""
+    """Sizes of the pictures of frames that state none; of those that do not exist, that of the first that does, or
+    None."""
     files = PictureFiles(folder)
-    sizes = [_picture_size(files, frame.get("file_path")) for frame in frames]
+    sizes = [None if SIZE & frame.keys() else _picture_size(files, frame.get("file_path")) for frame in frames]
     usual = next((size for size in sizes if size is not None), None)
     return [usual if size is None else size for size in sizes]
 
@@ -202,7 +217,7 @@ def _picture_name(name, i: int) -> str:
     """A file name without directory and picture suffix, whatever the views file says."""
     if isinstance(name, str):
         last = re.split(r"[/\\]", name)[-1]
-        last = re.sub(r"\.(png|jpe?g|webp|exr|tiff?|bmp)$", "", last, flags=re.IGNORECASE)
+        last = re.sub(r"\.(png|jpe?g|webp|exr|tiff?|bmp|avif)$", "", last, flags=re.IGNORECASE)
         last = re.sub(r"[^\w.-]+", "_", last).strip(".")
         if last:
             return last
@@ -235,7 +250,12 @@ def checked_pose(value, where: str) -> torch.Tensor:
 def _check_rotation(pose: torch.Tensor, where: str) -> None:
     rotation = pose[:3, :3]
     error = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max().item()
-    if error > 1e-2 or torch.linalg.det(rotation) < 0:  # files are rounded to a few digits
+    if error <= 1e-2 and torch.linalg.det(rotation) < 0:
+        raise SceneError(
+            f"{where} must hold a rotation, got a mirrored one (determinant -1): {rotation.tolist()}",
+            "one axis of the camera or of the world has the wrong sign, or two are swapped",
+        )
+    if error > 1e-2:  # files are rounded to a few digits
         raise SceneError(f"{where} must hold a rotation, got {rotation.tolist()}")
 
 

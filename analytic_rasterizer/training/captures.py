@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 
 import torch
 
 from .. import io
+from ..io.errors import counted_files, warn_of
 from ..render.effects import NEAR
 from . import colmap
-from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance
+from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance, shown_share
 from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, has_splits, read_layout
+from .photographs import broken_files
 from .placement import offset_of
 from .undistortion import window_of
 
@@ -26,6 +29,7 @@ CHOICES = {
     "alpha": ("background", "mask"),
 }
 """Of arguments of `load_capture`, which are options of `train` too; the first is the default."""
+FOLDED = 0.98  # of a picture: a lens that shows less folds back inside it, and not just in its corners
 SEARCH_DEPTH = 3  # folders below SCENE where an error looks for reconstructions
 
 
@@ -56,7 +60,8 @@ def load_capture(
             chosen as above.
         lens: "keep": the renderer has the lenses of the photographs; "undistort": photographs of cameras with a lens
             are resampled to pinholes; "refuse": they are an error.
-        missing: "refuse": pictures that are not there are an error; "skip": their cameras are left out.
+        missing: "refuse": pictures that are not there, or cannot be read, are an error; "skip": their cameras are left
+            out, and where it is the mask, all pixels count.
         masks: "auto": black pixels of masks do not count, neither in training nor in tests. Masks are pictures in
             COLMAP's folder `masks` with the name of the photograph, and .png after it or not, or nerfstudio's
             mask_path. "none": masks are ignored.
@@ -65,7 +70,8 @@ def load_capture(
             `offset_of` finds, which is nothing unless coordinates are far from zero.
 
     Warns of masks elsewhere, which are ignored, of photographs that are left out because their cameras are far from all
-    others, and of points so near to the cameras that they are not drawn.
+    others, and of points so near to the cameras that they are not drawn. Says how much of a picture a lens shows that
+    folds back inside it.
 
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens
@@ -74,23 +80,28 @@ def load_capture(
         ValueError: test_every is negative or 1; no such `lens`, `missing`, `masks` or `alpha`.
     """
     folder = _checked(folder, test_every, lens=lens, missing=missing, masks=masks, alpha=alpha)
-    capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras, missing))
+    capture = read_cameras(folder, images, test_every, cameras, missing, masks)
+    if missing == "skip":
+        capture = _without_broken(capture)
+    capture = without_outliers(folder, capture)
     check_capture(folder, capture)
     if capture.ignored_masks and masks == "auto":
-        warnings.warn(
-            f"{folder}: {capture.ignored_masks} masks are ignored, all pixels count: masks of photographs belong in "
-            f"{folder / MASKS}, or mask_path names them",
+        warn_of(
+            folder,
+            f"{capture.ignored_masks} masks are ignored, all pixels count: masks of photographs belong in "
+            f"{folder / MASKS}, or mask_path names them: {capture.about_masks}",
+            "--masks none ignores them without a word",
             stacklevel=2,
         )
-    capture = _with_masks(capture, masks, alpha)
+    capture = _with_alpha(capture, alpha)
     photographs = [*capture.train, *capture.test]
     _warn_of_near(folder, photographs, capture.points)
     distorted = [item for item in photographs if item.view.lens is not None]
     if distorted and lens == "refuse":
         raise io.SceneError(
             f"{folder}: {len(distorted)} of {len(photographs)} photographs have a lens, the first is "
-            f"{distorted[0].files[1]} ({distorted[0].view.lens.model}): leave out --lens refuse, or undistort them "
-            "first"
+            f"{distorted[0].files[1]} ({distorted[0].view.lens.model})",
+            "leave out --lens refuse, or undistort them first",
         )
     notes = list(capture.notes)
     masked = sum(item.mask is not None for item in photographs)
@@ -102,6 +113,7 @@ def load_capture(
         capture = _undistorted(capture)
     elif distorted:
         notes.append(_about_lenses(distorted, len(photographs)))
+        notes += about_folds(distorted)
     if offset is None:
         positions = None if capture.points is None else capture.points[0]
         offset = offset_of([item.view for item in photographs], positions)
@@ -127,9 +139,9 @@ def load_photographs(
     Arguments, and what is raised, as there.
     """
     folder = _checked(folder, test_every, lens=lens, missing=missing, masks=masks, alpha=alpha)
-    capture = read_cameras(folder, images, test_every, cameras, missing, with_points=False)
+    capture = read_cameras(folder, images, test_every, cameras, missing, masks, with_points=False)
     check_capture(folder, capture)
-    capture = _with_masks(capture, masks, alpha)
+    capture = _with_alpha(capture, alpha)
     return _undistorted(capture) if lens == "undistort" else capture
 
 
@@ -147,21 +159,31 @@ def _checked(folder, test_every: int, **choices: str) -> Path:
 
 
 def read_cameras(
-    folder: Path, images: str, test_every: int, cameras: str | None, missing: str, with_points: bool = True
+    folder: Path,
+    images: str,
+    test_every: int,
+    cameras: str | None,
+    missing: str,
+    masks: str = "auto",
+    with_points: bool = True,
 ) -> Capture:
     """The capture in world coordinates, as far as files of cameras and points say. Arguments as `load_capture`."""
 
     def read(place: Path) -> Capture:
         capture = read_layout(folder, place, images, test_every, with_points)._replace(source=place)
+        capture = _each(capture, mask=None) if masks == "none" else capture
         return _without_missing(capture) if missing == "skip" else capture
 
     if cameras is not None:
         return read(folder / cameras)
-    places = _places(folder)
+    places, parts = _places(folder), _parts(folder)
+    if not places and parts is not None:
+        raise colmap.incomplete(parts)
     if not places:
         raise io.SceneError(
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
-            f"(.bin or .txt) in sparse/0{_elsewhere(folder)}"
+            "(.bin or .txt) in sparse/0",
+            *_elsewhere(folder),
         )
     found, passed_over = {}, {}
     for place in places:
@@ -182,26 +204,52 @@ def read_cameras(
         offered = " or ".join(str(place.relative_to(folder)) for place in others)
         instead = f"; --cameras takes {offered} instead" if others else ""
         notes.append(f"cameras are those of {chosen.relative_to(folder)}{instead}")
-    notes += [f"passed over: {error}" for error in passed_over.values()]
+    errors = [*passed_over.values(), *([] if parts is None else [colmap.incomplete(parts)])]
+    notes += [f"passed over: {error.message}" for error in errors]
     return found[chosen]._replace(notes=(*found[chosen].notes, *notes))
 
 
 def _without_missing(capture: Capture) -> Capture:
-    """The capture without photographs of which a file is not there, and with a note that counts them."""
-    train, test = (
-        [item for item in items if all(path.is_file() for path in item.files.values())]
-        for items in (capture.train, capture.test)
-    )
+    """The capture without photographs of which a file is not there, and without masks that are not there; with notes
+    that count them."""
+    files = {path for item in (*capture.train, *capture.test) for path in (*item.files.values(), item.mask) if path}
+    return without_files(capture, {path for path in files if not path.is_file()}, "are missing")
+
+
+def _without_broken(capture: Capture) -> Capture:
+    """The same for files that cannot be read. Reads all of them."""
+    files = [path for item in (*capture.train, *capture.test) for path in (*item.files.values(), item.mask) if path]
+    return without_files(capture, broken_files(files).keys(), "cannot be read")
+
+
+def without_files(capture: Capture, bad: Collection[Path], problem: str) -> Capture:
+    """The capture without photographs of which a file is `bad`, and without masks that are; with notes of that."""
+    if not bad:
+        return capture
     items = [*capture.train, *capture.test]
-    missing = tuple(path for item in items for path in item.files.values() if not path.is_file())
-    left_out = len(items) - len(train) - len(test)
-    notes = (f"{left_out} of {len(items)} pictures are missing and left out",) if left_out else ()
-    return capture._replace(train=train, test=test, notes=(*capture.notes, *notes), missing=missing)
+    pictures = tuple(path for item in items for path in item.files.values() if path in bad)
+    masks = tuple(dict.fromkeys(item.mask for item in items if item.mask in bad))
+    train, test = (
+        [
+            item._replace(mask=None if item.mask in bad else item.mask)
+            for item in split
+            if bad.isdisjoint(item.files.values())
+        ]
+        for split in (capture.train, capture.test)
+    )
+    notes, left_out = list(capture.notes), len(items) - len(train) - len(test)
+    if left_out:
+        notes.append(f"{left_out} of {len(items)} pictures {problem} and left out")
+    if masks:
+        affected = sum(item.mask in bad for item in items)
+        notes.append(f"the masks of {affected} of {len(items)} pictures {problem}: all of their pixels count")
+    missing, without_mask = (*capture.missing, *pictures), (*capture.missing_masks, *masks)
+    return capture._replace(train=train, test=test, notes=tuple(notes), missing=missing, missing_masks=without_mask)
 
 
 def is_capture(folder: Path) -> bool:
     """Whether a folder holds cameras in one of the layouts, as far as the names of its files tell."""
-    return folder.is_dir() and bool(_places(folder))
+    return folder.is_dir() and (bool(_places(folder)) or _parts(folder) is not None)
 
 
 def _places(folder: Path) -> list[Path]:
@@ -218,6 +266,14 @@ def _places(folder: Path) -> list[Path]:
     if metadata.exists() and not (others and not has_splits(metadata)):
         return [metadata]
     return [synthetic] if synthetic.exists() else several
+
+
+def _parts(folder: Path) -> Path | None:
+    """Where there is a part of a reconstruction, and no whole one."""
+    places = [folder / name for name in RECONSTRUCTIONS]
+    if any(map(colmap.is_reconstruction, places)) or any(_models_in(place) for place in places):
+        return None
+    return next((place for place in places if colmap.parts_of(place)), None)
 
 
 def _models_beside(model: Path) -> list[Path]:
@@ -238,21 +294,28 @@ def _models_in(folder: Path) -> list[Path]:
     return sorted(filter(colmap.is_reconstruction, numbered), key=lambda path: int(path.name))
 
 
-def _elsewhere(folder: Path) -> str:
-    """How an error that finds nothing in a folder goes on: with a reconstruction in a folder below."""
-    below = (path for depth in range(1, SEARCH_DEPTH + 1) for path in sorted(folder.glob("/".join("*" * depth))))
+def _elsewhere(folder: Path) -> list[str]:
+    """Advice of an error that finds nothing in a folder: a reconstruction in a folder below."""
+    below = [path for depth in range(1, SEARCH_DEPTH + 1) for path in sorted(folder.glob("/".join("*" * depth)))]
     found = next((path.relative_to(folder) for path in below if colmap.is_reconstruction(path)), None)
-    return "" if found is None else f"; there is a reconstruction in {found} (--cameras {found}, --images FOLDER)"
+    return [] if found is None else [f"there is a reconstruction in {found} (--cameras {found}, --images FOLDER)"]
 
 
 def check_capture(folder: Path, capture: Capture) -> None:
-    """Raises io.SceneError for pictures that are missing, and where there is too little to train with."""
-    files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
-    missing = [path for path in files if not path.is_file()]
+    """Raises io.SceneError for pictures and masks that are missing, and where there is too little to train with."""
+    items = [*capture.train, *capture.test]
+    files = [path for item in items for path in item.files.values()]
+    masks = list(dict.fromkeys(item.mask for item in items if item.mask is not None))
+    missing, without_mask = ([path for path in paths if not path.is_file()] for paths in (files, masks))
     if missing:
+        counted = counted_files(missing, len(files), "pictures", "are missing")
+        raise io.SceneError(f"{folder}: {counted}", "--missing skip leaves them out")
+    if without_mask:
+        counted = counted_files(without_mask, len(masks), "masks that mask_path names", "are missing")
         raise io.SceneError(
-            f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]} (--missing skip "
-            "leaves them out)"
+            f"{folder}: {counted}",
+            "--masks none ignores masks",
+            "--missing skip lets all pixels count where a mask is missing",
         )
     if len(capture.train) < 2:
         raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
@@ -296,10 +359,8 @@ def _warn_of_near(
         )
 
 
-def _with_masks(capture: Capture, masks: str, alpha: str) -> Capture:
-    """The capture with what these arguments of `load_capture` say of its photographs."""
-    if masks == "none":
-        capture = _each(capture, mask=None)
+def _with_alpha(capture: Capture, alpha: str) -> Capture:
+    """The capture with what this argument of `load_capture` says of its photographs."""
     return _each(capture, alpha_is_mask=True) if alpha == "mask" else capture
 
 
@@ -315,7 +376,7 @@ def _check_windows(folder: Path, distorted: list[Photograph]) -> None:
         try:
             window_of(item.view)
         except io.SceneError as error:
-            raise io.SceneError(f"{folder}: {item.files[1]}: {error}; leave out --lens undistort") from None
+            raise io.SceneError(f"{folder}: {item.files[1]}: {error.message}", "leave out --lens undistort") from None
 
 
 def _undistorted(capture: Capture) -> Capture:
@@ -335,6 +396,20 @@ def _about_lenses(distorted: list[Photograph], number: int) -> str:
     """Which photographs have a lens, in a sentence."""
     which = f"{len(distorted)} of {number} photographs have a lens ({lens_models(distorted)})"
     return f"{which}, with which they are rendered"
+
+
+def about_folds(distorted: list[Photograph]) -> list[str]:
+    """What is to be said of photographs whose lens folds back inside the picture, in at most one sentence: nothing is
+    drawn beyond the fold, and nothing can be learned there."""
+    shares = {item.files[1]: shown_share(item.view) for item in distorted}
+    folded = {path: share for path, share in shares.items() if share < FOLDED}
+    if not folded:
+        return []
+    path, least = min(folded.items(), key=lambda entry: entry[1])
+    return [
+        f"the lens of {len(folded)} photographs folds back inside the picture, and shows {least:.0%} of {path.name}, "
+        "so that nothing is learned in the rest: its coefficients are wrong there, so calibrate again, or mask the rest"
+    ]
 
 
 def _about_lost_area(distorted: list[Photograph], number: int) -> str:

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from .. import io
 from ..cameras.rotations import rotation_matrices
+from ..io.errors import check_content
 from ..io.lenses import lens_of_colmap
-from ..io.views import with_distinct_names
+from ..io.views import checked_pixels, with_distinct_names
 
 
 class Model(NamedTuple):
@@ -73,6 +74,18 @@ def is_reconstruction(folder: Path) -> bool:
     return _suffix(folder) is not None
 
 
+def parts_of(folder: Path) -> list[str]:
+    """Names of the files of a reconstruction that are in a folder, complete or not."""
+    names = (f"{name}{suffix}" for suffix in SUFFIXES for name in (CAMERAS, IMAGES, POINTS))
+    return [name for name in names if (folder / name).is_file()]
+
+
+def incomplete(folder: Path) -> io.SceneError:
+    """The error of a folder that is no reconstruction: what is expected, and what is there."""
+    expected = f"COLMAP's {CAMERAS} and {IMAGES}, both {' or both '.join(SUFFIXES)}"
+    return io.SceneError.of(folder, expected, ", ".join(parts_of(folder)) or "none of them")
+
+
 def _suffix(folder: Path) -> str | None:
     complete = (s for s in SUFFIXES if all((folder / f"{name}{s}").is_file() for name in (CAMERAS, IMAGES)))
     return next(complete, None)
@@ -115,8 +128,7 @@ def load_views(folder: Path) -> list[Registered]:
 
 def _intrinsics(where: str, model: str, width: int, height: int, parameters: list[float]) -> dict[str, Any]:
     """Members of `View`. Raises io.SceneError, which begins with `where`, the camera."""
-    if width < 1 or height < 1:
-        raise io.SceneError(f"{where} must have a positive size and focal length")
+    width, height = (checked_pixels(size, f"{where}: {name}") for name, size in (("width", width), ("height", height)))
     pinhole, lens = lens_of_colmap(model, parameters, where)
     return {"width": width, "height": height, "lens": lens, **pinhole}
 
@@ -233,6 +245,7 @@ class _Records:
     """A binary file, read from front to back."""
 
     def __init__(self, path: Path):
+        check_content(path)
         self.path, self.data, self.position = path, path.read_bytes(), 0
         (self.count,) = self.take("Q")
 
@@ -262,6 +275,7 @@ class _Records:
 
 def _text_lines(path: Path) -> list[str]:
     """The lines of a file, which may begin with a byte order mark, and have line ends of any system."""
+    check_content(path)
     return path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
 
 

@@ -10,14 +10,16 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from .. import io
 from .layouts import Photograph
-from .photographs import read_file, read_mask
+from .photographs import broken_files, read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
 MOST_POINTS, MOST_HIDING = 8192, 200_000  # points that are looked at, and points behind which they may be hidden
@@ -56,6 +58,7 @@ class Evidence(NamedTuple):
         seen: (points,) int64, how many photographs can see it.
         transparent: (count,) bool, whether a picture has pixels that are not opaque.
         light: (count, 3) float64, mean light of the opaque pixels; NaN where there are none, or there are points.
+        counted: (count,) float64, the share of a picture that its mask lets count.
     """
 
     count: int
@@ -70,6 +73,15 @@ class Evidence(NamedTuple):
     seen: Tensor
     transparent: Tensor
     light: Tensor
+    counted: Tensor | None = None
+
+
+class BrokenPictures(io.SceneError):
+    """Files of pictures or masks cannot be read, `files`."""
+
+    def __init__(self, errors: dict[Path, io.SceneError]):
+        super().__init__(next(iter(errors.values())).message)
+        self.files = errors.keys()
 
 
 def spread_out(items: Sequence, most: int) -> list:
@@ -98,7 +110,7 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         points: (P, 3) float64, in the frame of the views; None where there are none.
         tracks: Rows of the points that a photograph observes, by the names of views; empty: a test of depths says it.
 
-    Raises io.SceneError for a picture that cannot be read.
+    Raises BrokenPictures for files that cannot be read, and io.SceneError for a mask of another shape than its picture.
     """
     points = torch.zeros(0, 3, dtype=torch.float64) if points is None else points.double()
     step = max(-(-len(points) // MOST_HIDING), 1)
@@ -110,8 +122,19 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         candidates = (torch.bincount(rows, minlength=len(points)) >= LEAST_SEEN).nonzero()[:, 0]
     if len(candidates):
         chosen[candidates[:: -(-len(candidates) // MOST_POINTS)]] = True
+
+    def look(item: Photograph) -> _Look | io.SceneError:
+        try:
+            return _look(item, points, chosen, tracks)
+        except io.SceneError as error:
+            return error
+
     with ThreadPoolExecutor(READERS) as pool:
-        looks = list(pool.map(lambda item: _look(item, points, chosen, tracks), items))
+        looks = list(pool.map(look, items))
+    errors = [(item, found) for item, found in zip(items, looks) if isinstance(found, io.SceneError)]
+    if errors:
+        broken = broken_files(path for item, _ in errors for path in (item.files[1], item.mask) if path is not None)
+        raise BrokenPictures(broken) if broken else errors[0][1]
     observed = [look.observed for look in looks]
     nearest, farthest = points.new_full((len(points),), math.inf), points.new_zeros(len(points))
     seen = torch.zeros(len(points), dtype=torch.int64)
@@ -132,6 +155,7 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         seen=seen,
         transparent=torch.tensor([look.transparent for look in looks]),
         light=torch.stack([look.light for look in looks]),
+        counted=torch.tensor([look.counted for look in looks], dtype=torch.float64),
     )
 
 
@@ -144,6 +168,7 @@ class _Look(NamedTuple):
     observed: Tensor  # (O,) the points whose pixels are measured
     sampled: Tensor  # (O, 7) of `_sampled`
     light: Tensor  # (3,) mean of the opaque pixels, without points
+    counted: float  # share of the picture that its mask lets count
 
 
 def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Tensor]) -> _Look:
@@ -151,13 +176,16 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     transparent = bool((rgba[:, :, 3] < 255).any())
     none = torch.zeros(0, dtype=torch.int64)
     planes = rgba.permute(2, 0, 1)[None].float() / 255
+    counted = 1.0
     if item.mask is not None:  # what does not count is not looked at
-        planes[0, 3] *= read_mask(item.mask, rgba.shape[1], rgba.shape[0]).float() / 255
+        mask = read_mask(item.mask, rgba.shape[1], rgba.shape[0]).float() / 255
+        counted = mask.mean().item()
+        planes[0, 3] *= mask
     reduction = -(-max(rgba.shape[:2]) // LARGEST)
     planes = functional.avg_pool2d(planes, reduction) if reduction > 1 else planes
     if not len(points):
         light = _linear(planes[0, :3, planes[0, 3] == 1].double()).mean(1)
-        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7), light)
+        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7), light, counted)
     height, width = planes.shape[2:]
     view = item.view.resized(width, height)
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
@@ -174,7 +202,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     opaque = sampled[:, 6] == 1
     intervals = depth[visible] / math.sqrt(view.fx * view.fy)
     unknown = points.new_full((3,), math.nan)
-    return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque], unknown)
+    return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque], unknown, counted)
 
 
 def _in_front(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:

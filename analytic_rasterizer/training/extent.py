@@ -8,17 +8,20 @@ camera with a wrong pose may be anywhere.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from ..cameras.camera import View
+from ..cameras.lens import Lens
 
 RADIUS_FACTOR = 1.1  # [3DGS]
 SEEN_SHARE = 0.5  # of the distance of what cameras see: the least extent
 OUTLYING = 10  # times as far from the middle as every other camera
 MOST_OUTLIERS = 5  # at most one in so many cameras is an outlier
 MOST_VIEWS, MOST_POINTS = 64, 2048  # of which a median is taken
+GRID = 33  # points along each side of a picture, at which its lens is looked at
 ROUNDING = 1e-9  # of coordinates: cameras no further apart are at one place
 
 
@@ -81,6 +84,20 @@ def outliers_of(views: Sequence[View], points: Tensor | None = None) -> dict[int
             if i >= few or all(seen_distance([views[view]], points) == 0 for view in far):
                 return dict(zip(far, distances[i:].tolist()))
     return {}
+
+
+@lru_cache(maxsize=64)
+def _shown_share(lens: Lens, width: int, height: int, fx: float, fy: float, middle: tuple[float, float]) -> float:
+    view = View("", width, height, fx, fy, torch.eye(4, dtype=torch.float64, device="cpu"), *middle, lens=lens)
+    x, y = (size * (torch.arange(GRID, dtype=torch.float64, device="cpu") + 0.5) / GRID for size in (width, height))
+    return view.rays_of(torch.cartesian_prod(x, y)).isfinite().all(1).double().mean().item()
+
+
+def shown_share(view: View) -> float:
+    """The share of a picture's pixels that show something: less than 1 where a lens folds back inside it."""
+    if view.lens is None:
+        return 1.0
+    return _shown_share(view.lens, view.width, view.height, view.fx, view.fy, view.middle)
 
 
 def is_one_pose(views: Sequence[View]) -> bool:

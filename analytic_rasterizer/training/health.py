@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from statistics import mean
 from typing import Protocol
 
 import torch
@@ -11,12 +12,15 @@ from torch import Tensor
 from ..density import FixedDensity
 from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
+from ..io.errors import SceneError
 from ..io.scenes import numbers_of
 from .options import TrainingOptions, flag
 from .pictures import Pictures
 from .rendering import render
 from .schedule import Progress
+from .store import described
 
+NAMED = 3  # photographs in a sentence
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity
 MOST_BROKEN = 0.5  # of the Gaussians: a training that loses more at once diverges
 LEAST_SIDE = 11  # px, that of the window of SSIM
@@ -159,6 +163,38 @@ def _causes(trainer: Trainer) -> str:
     )
 
 
+def look_at_pictures(scene, pictures: Pictures, device: torch.device) -> list[str]:
+    """What there is to say of the pictures of a training for a device: where they are, whether they are small, and what
+    masks leave out.
+
+    Warns of pictures of one colour. Raises as `check_masks`.
+    """
+    waiting = [described(pictures.store.plan, device)] if pictures.store.plan.ahead else []
+    masks = check_masks(scene, pictures)
+    warn_of_one_color(scene, pictures)
+    return [*waiting, *small_pictures(pictures), *masks]
+
+
+def check_masks(scene, pictures: Pictures) -> list[str]:
+    """What there is to say of how much masks leave out, in at most one sentence.
+
+    Args:
+        scene: Where the pictures are from.
+
+    Raises io.SceneError where nothing counts in any picture.
+    """
+    shares = pictures.shares
+    if not shares or min(shares) == 1:
+        return []
+    empty = [view.name for view, share in zip(pictures.views, shares) if share == 0]
+    if len(empty) == len(shares):
+        got = f"none in all {len(shares)} photographs, whose masks are black or transparent everywhere"
+        raise SceneError.of(scene, "pixels that count", got, "--masks none ignores masks")
+    left_out = f"masks leave out {1 - mean(shares):.1%} of the pixels"
+    named = f"{', '.join(empty[:NAMED])}{', ..' * (len(empty) > NAMED)}"
+    return [f"{left_out}; nothing counts in {len(empty)} photographs: {named}" if empty else left_out]
+
+
 def warn_of_one_color(scene, pictures: Pictures) -> None:
     """Warns if each of the finest pictures has one colour.
 
@@ -168,7 +204,7 @@ def warn_of_one_color(scene, pictures: Pictures) -> None:
     finest = pictures.colors[min(pictures.colors)]
     if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
         told = f"{scene}: all {len(finest)} photographs are of one colour, nothing can be learned"
-        warnings.warn(told, stacklevel=4)  # where the training is made
+        warnings.warn(told, stacklevel=6)  # where the training is made
 
 
 def small_pictures(pictures: Pictures) -> list[str]:

@@ -22,7 +22,9 @@ from ..io.views import checked_pixels, checked_pose, checked_positive, read_view
 from . import colmap
 
 MASKS = "masks"  # COLMAP's folder of them, beside that of the pictures
-MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
+# Of folders, as Masks or dynamic_masks, and of files, as a_mask.jpg or a.jpg.mask.png.
+MASK_FOLDER = re.compile(r"([^a-z]|^)(masks?|segmentations?|mattes?|silhouettes?)([^a-z]|$)", re.IGNORECASE)
+MASK_FILE = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)
 
 
 class Photograph(NamedTuple):
@@ -55,8 +57,10 @@ class Capture(NamedTuple):
         starts_in_view: Whether random points belong in the views, where there are no others, or in the cube of
             NeRF-synthetic.
         ignored_masks: How many files of masks there are that belong to no convention.
+        about_masks: Which of them was found, and what was expected; "" where there are none.
         notes: Sentences of what was chosen, for the user.
-        missing: Pictures without a file, whose photographs were left out.
+        missing: Pictures without a file, or whose file cannot be read, whose photographs were left out.
+        missing_masks: The same of masks, whose photographs count everywhere.
         source: The file or folder that the cameras come from; None: unknown.
     """
 
@@ -70,6 +74,8 @@ class Capture(NamedTuple):
     notes: tuple[str, ...] = ()
     missing: tuple[Path, ...] = ()
     source: Path | None = None
+    about_masks: str = ""
+    missing_masks: tuple[Path, ...] = ()
 
 
 def read_layout(folder: Path, place: Path, images: str, test_every: int, with_points: bool = True) -> Capture:
@@ -84,7 +90,8 @@ def read_layout(folder: Path, place: Path, images: str, test_every: int, with_po
     if place.name == "transforms_train.json":
         test_file = place.with_name("transforms_test.json")
         test = transforms(test_file)[0] if test_file.exists() else []
-        return Capture(transforms(place)[0], test, WHITE, initial_points(folder) if with_points else None)
+        train, data = transforms(place)
+        return Capture(train, test, WHITE, _points_beside(place, data.get("ply_file_path")) if with_points else None)
     return nerfstudio(place, test_every, with_points)
 
 
@@ -94,27 +101,24 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, wit
     Raises io.SceneError for what `colmap.load_views` refuses.
     """
     if not colmap.is_reconstruction(sparse):
-        raise io.SceneError(f"{sparse}: expected COLMAP's cameras and images (.bin or .txt)")
+        raise colmap.incomplete(sparse)
     registered = colmap.load_views(sparse)
     if not registered:
         raise io.SceneError(f"{sparse}: there are no pictures in the reconstruction")
     if not (folder / images).is_dir():
         there = sorted(path.name for path in folder.iterdir() if path.is_dir() and _count_pictures(path))
-        expected = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
-        raise io.SceneError(f"{folder / images}: no such folder; {expected}")
+        other = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
+        raise io.SceneError(f"{folder / images}: no such folder", other)
     files = PictureFiles(folder / images)
     masks = PictureFiles(folder / MASKS)
     items = [Photograph(item.view, {1: files.find(item.name)}, mask=_mask_of(masks, item.name)) for item in registered]
     points = colmap.load_points(sparse) if with_points else None
     if points is None and with_points:
         points = initial_points(sparse)
-    return Capture(
-        *_split(folder, items, test_every),
-        BLACK,
-        points,
-        starts_in_view=True,
-        ignored_masks=0 if any(item.mask for item in items) else _count_masks(folder, folder / images),
-    )
+    name = registered[0].name
+    expected = f"{MASKS}/{name}.png or {MASKS}/{name} for the photograph {name}"
+    ignored = _ignored_masks(items, expected, folder, folder / images)
+    return Capture(*_split(folder, items, test_every), BLACK, points, starts_in_view=True, **ignored)
 
 
 def _mask_of(masks: PictureFiles, name: str) -> Path | None:
@@ -135,8 +139,9 @@ def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
     found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         mask = frame.get("mask_path")
-        if mask is not None and not (isinstance(mask, str) and (mask := files.find(mask)).is_file()):
+        if mask is not None and not isinstance(mask, str):
             raise io.SceneError(f"{path}: frame {i}: mask_path must name a picture beside the file, got {mask!s}")
+        mask = None if mask is None else files.find(mask)
         found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, mask=mask))
     return found, data
 
@@ -155,7 +160,7 @@ def nerfstudio(path: Path, test_every: int, with_points: bool = True) -> Capture
     items, data = transforms(path)
     points = _points_beside(path, data.get("ply_file_path")) if with_points else None
     items.sort(key=lambda item: str(item.files[1]))
-    ignored = 0 if any(item.mask for item in items) else _count_masks(path.parent)
+    ignored = _ignored_masks(items, "mask_path in the frames", path.parent)
     pictures, lists = PictureFiles(path.parent), {}
     files = [os.path.normpath(item.files[1]) for item in items]
     for split in ("train", "val", "test"):
@@ -172,7 +177,7 @@ def nerfstudio(path: Path, test_every: int, with_points: bool = True) -> Capture
         splits = [[item for file, item in zip(files, items) if file in names] for names in (train, test)]
     else:
         splits = _split(path.parent, items, test_every)
-    return Capture(*splits, BLACK, points, starts_in_view=True, ignored_masks=ignored)
+    return Capture(*splits, BLACK, points, starts_in_view=True, **ignored)
 
 
 def _points_beside(path: Path, name: Any) -> tuple[Tensor, Tensor] | None:
@@ -240,17 +245,35 @@ def _split(folder: Path, items: list[Photograph], test_every: int) -> tuple[list
     if len(train) < 2 <= len(items):
         raise io.SceneError(
             f"{folder}: training needs at least 2 pictures, got {len(train)} of {len(items)}, for the others are kept "
-            "for the test; --test-every 0 trains with all"
+            "for the test",
+            "--test-every 0 trains with all",
         )
     return train, items[::test_every]
 
 
 def _count_pictures(folder: Path) -> int:
     """Files of pictures in a folder and those below it."""
-    return sum(path.suffix.lower() in PICTURE_SUFFIXES for path in folder.rglob("*"))
+    return len(_pictures_in(folder))
 
 
-def _count_masks(*folders: Path) -> int:
-    """How many masks are beside the pictures: in the fullest folder of masks right below one of `folders`."""
-    below = {path for folder in folders if folder.is_dir() for path in folder.iterdir()} - set(folders)
-    return max((_count_pictures(path) for path in below if MASK_FOLDER.search(path.name) and path.is_dir()), default=0)
+def _pictures_in(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if _is_picture(path)]
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PICTURE_SUFFIXES
+
+
+def _ignored_masks(items: list[Photograph], expected: str, *folders: Path) -> dict[str, Any]:
+    """`ignored_masks` and `about_masks` of a capture: masks that no photograph has, in the fullest folder of masks
+    right below one of the folders or of those of the pictures, or else beside the pictures."""
+    if any(item.mask for item in items):
+        return {}
+    pictures = {item.files[1] for item in items}
+    folders += tuple(sorted({path.parent for path in pictures}))
+    listed = [path for folder in dict.fromkeys(folders) if folder.is_dir() for path in sorted(folder.iterdir())]
+    below = [path for path in listed if path not in folders and path.is_dir() and MASK_FOLDER.search(path.name)]
+    found = max((sorted(_pictures_in(path)) for path in below), key=len, default=[])
+    found = found or [path for path in listed if _is_picture(path) and MASK_FILE.search(path.stem)]
+    found = [path for path in found if path not in pictures]
+    return {"ignored_masks": len(found), "about_masks": f"found {found[0]}, expected {expected}" if found else ""}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from ..io.images import opened_picture
 
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
 TURNED = range(2, 9)  # its values for the others
+LOSSY = ("JPEG", "MPO", "WEBP", "AVIF")  # formats of Pillow, in which black is not always 0
 STRIP = 64  # rows that are converted at a time
 
 
@@ -34,6 +36,10 @@ class Header(NamedTuple):
     def fits_turned(self, view: io.View) -> bool:
         """Whether it can be after a quarter turn."""
         return _is_reduced(self.height, self.width, view.width, view.height)
+
+    def is_cut(self, view: io.View) -> bool:
+        """Whether it has one side of its camera's picture, and not the other."""
+        return not self.fits(view) and (self.width == view.width) != (self.height == view.height)
 
     def tells_orientation(self, view: io.View) -> bool:
         """Whether it is certainly stored as its camera saw it: EXIF says so, or a quarter turn would not fit."""
@@ -59,23 +65,61 @@ class Stored(NamedTuple):
 
 
 def read_mask(path: Path, width: int, height: int) -> Tensor:
-    """(H, W) uint8 of a mask for a picture of this size: 255 where it is brighter than half of its brightest pixel.
+    """(H, W) uint8 of a mask for a picture of this size: 255 where it is neither black nor transparent.
 
-    A mask of another size is scaled; pixels on its edges then count in part. Raises io.SceneError for a mask that
-    cannot be read, or that has another shape than the picture.
+    That is COLMAP's and nerfstudio's rule. In formats that lose something, black is up to half of the brightest level.
+    A mask of one colour with alpha is its alpha. A mask of another size is scaled; pixels on its edges then count in
+    part. Raises io.SceneError for a mask that cannot be read, or that has another shape than the picture.
     """
     with opened_picture(path, "train") as opened:
-        levels = torch.from_numpy(np.array(opened.convert("L")))
-    own_height, own_width = levels.shape
+        counts = _counts(opened)
+    own_height, own_width = counts.shape
     if not (_is_reduced(own_width, own_height, width, height) or _is_reduced(width, height, own_width, own_height)):
         raise io.SceneError(
             f"{path}: expected a mask of the shape of its picture, {width} x {height} px, got {own_width} x "
             f"{own_height}"
         )
-    counted = 255 * (levels > levels.max() / 2).to(torch.uint8)
+    counted = 255 * torch.from_numpy(counts).to(torch.uint8)
     if (own_width, own_height) == (width, height):
         return counted
     return functional.interpolate(counted[None, None].float(), (height, width), mode="area")[0, 0].round().byte()
+
+
+def _counts(opened) -> np.ndarray:
+    """(H, W) bool: where the Pillow image of a mask lets pixels count."""
+    lossy, alpha = opened.format in LOSSY, None
+    if opened.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in opened.info:
+        opened = opened.convert("RGBA")
+        alpha = np.array(opened.getchannel("A"))
+    grey = opened.mode in ("1", "L", "F") or opened.mode.startswith("I")
+    levels = np.array(opened) if grey else np.array(opened.convert("RGB")).max(2)
+    bright = levels > (levels.max() / 2 if lossy else 0)
+    if alpha is None or alpha.min() == 255:
+        return bright
+    return alpha > 0 if levels.min() == levels.max() else bright & (alpha > 0)
+
+
+def broken_files(files: Iterable[Path]) -> dict[Path, io.SceneError]:
+    """The files of pictures that cannot be decoded, and what is wrong with them. Reads all of them, in threads."""
+
+    def look(path: Path) -> io.SceneError | None:
+        try:
+            read_file(path, 1)
+        except io.SceneError as error:
+            return error
+        return None
+
+    files = list(dict.fromkeys(files))
+    with ThreadPoolExecutor() as pool:
+        return {path: error for path, error in zip(files, pool.map(look, files)) if error is not None}
+
+
+def unreadable_pictures(errors: Sequence[io.SceneError], count: int) -> io.SceneError:
+    """One error for those of so many pictures."""
+    first = errors[0].message
+    if len(errors) > 1:
+        first = f"{len(errors)} of {count} pictures cannot be read, the first is {first}"
+    return io.SceneError(first, *errors[0].advice, "--missing skip leaves out what cannot be read")
 
 
 def read_file(path: Path, largest: int | None = None) -> Stored:

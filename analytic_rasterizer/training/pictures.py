@@ -16,11 +16,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
-from ..io.errors import naming
+from ..io.errors import SceneWarning, counted_files, naming
 from ..render.settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .parts import check_scales
-from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size
+from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size, unreadable_pictures
 from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens
 
@@ -40,6 +40,7 @@ class Pictures(NamedTuple):
         masks: By scale, for every view: (H, W) uint8, the share of each pixel that counts; None: all of them count,
             in all views if it stands for the dict.
         store: Where `load_pictures` has put them; None: colours and masks are lists.
+        shares: For every view, the share of its finest picture that counts; empty: not known.
     """
 
     views: list[io.View]
@@ -47,6 +48,7 @@ class Pictures(NamedTuple):
     colors: dict[int, Sequence[Tensor]]
     masks: dict[int, Sequence[Tensor | None]] | None = None
     store: Store | None = None
+    shares: Sequence[float] = ()
 
     @property
     def horizon(self) -> int:
@@ -115,28 +117,35 @@ def load_pictures(
         memory: How much of it pictures may take; None: the shares of `PictureMemory`.
 
     Warns of pictures that EXIF says to turn, unless their sizes show that they fit their cameras as they are stored.
-    They are not turned.
+    They are not turned. Warns of pictures of another shape than their cameras', see `fitted`.
 
     Raises:
-        io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales;
-            memory that does not suffice, before a picture is read.
+        io.SceneError: Pictures that cannot be read, of which it says how many there are; one that holds numbers that
+            are not finite, or is too small for the scales; memory that does not suffice, before a picture is read.
         ValueError: Scales that are not whole numbers of at least 1; `memory` that is none.
     """
     check_scales(scales)
     device, memory = torch.device(device), memory or PictureMemory()
     memory.check(device)
     recipe = Recipe(math.lcm(*scales), background, downsampling)
-    sizes, pixels = _sizes(items, scales, recipe)
+    shapes = read_sizes(items)
+    sizes, pixels = _sizes(shapes, scales, recipe)
     free = free_memory(device)
     plan = plan_places(sizes, pixels, limits_of(memory, free, device), free, device, memory.processes)
     views, settings, kept = [], {scale: [] for scale in scales}, {}
-    to_turn = []
+    to_turn, errors, shares = [], [], []
     with closing(_read_ahead(items, scales, plan.threads)) as ahead:
         for number, (item, files) in enumerate(zip(items, ahead)):
+            if isinstance(files, io.SceneError):
+                errors.append(files)
+            if errors:  # the others are read to say how many there are
+                continue
             if not files[1].header.tells_orientation(item.view):
                 to_turn.append(item.files[1])
             view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
             views.append(view)
+            mask = of_scales[min(scales)].mask
+            shares.append(1.0 if mask is None else mask.float().mean().item() / 255)
             for scale in scales:
                 place = plan.places[scale, number]
                 if place != FILE:
@@ -144,6 +153,9 @@ def load_pictures(
                 # In fractions: the cut makes both sizes multiples of the scale.
                 behind = (0.0, 0.0, 0.0) if background is None else background
                 settings[scale].append(view.settings(1 / scale, behind, device=device))
+    if errors:
+        raise unreadable_pictures(errors, len(items))
+    warn_of_shapes(shapes)
     if to_turn:
         named = ", ".join(str(path) for path in to_turn[:NAMED])
         warnings.warn(
@@ -164,7 +176,7 @@ def load_pictures(
         fields = columns(store, scales, len(items))
     else:
         fields = ({scale: [kept[scale, i][k] for i in range(len(items))] for scale in scales} for k in range(2))
-    return Pictures(views, settings, *fields, store)
+    return Pictures(views, settings, *fields, store, shares)
 
 
 class Recipe(NamedTuple):
@@ -175,21 +187,58 @@ class Recipe(NamedTuple):
     downsampling: str
 
 
-def _sizes(items: list[Photograph], scales: tuple[int, ...], recipe: Recipe) -> tuple[dict[Key, int], int]:
+def read_sizes(items: list[Photograph]) -> list[tuple[Photograph, Header]]:
+    """The photographs with the sizes of their files; orientations are not read.
+
+    Raises io.SceneError for files that are no pictures, of which it says how many there are.
+    """
+
+    def read(item: Photograph) -> tuple[int, int] | io.SceneError:
+        try:
+            return read_size(item.files[1])
+        except io.SceneError as error:
+            return error
+
+    with ThreadPoolExecutor() as pool:
+        sizes = list(pool.map(read, items))
+    errors = [size for size in sizes if isinstance(size, io.SceneError)]
+    if errors:
+        raise unreadable_pictures(errors, len(items))
+    return [(item, Header(*size, UPRIGHT)) for item, size in zip(items, sizes)]
+
+
+def _sizes(
+    shapes: list[tuple[Photograph, Header]], scales: tuple[int, ...], recipe: Recipe
+) -> tuple[dict[Key, int], int]:
     """Bytes of every picture, and pixels of the largest photograph, by what the files say before they are decoded."""
     sizes, pixels = {}, 0
     channels = 4 if recipe.background is None else 3
-    with ThreadPoolExecutor() as pool:
-        for number, (item, size) in enumerate(zip(items, pool.map(lambda item: read_size(item.files[1]), items))):
-            pixels = max(pixels, math.prod(size))
-            view = _view_of(item, *size)
-            with naming(item.files[1]):
-                width, height = window_of(view)[2:4] if item.undistort else (view.width, view.height)
-            planes = channels + (item.mask is not None or item.alpha_is_mask)
-            for scale in scales:
-                lengths = ((length - length % recipe.multiple) // scale for length in (width, height))
-                sizes[scale, number] = planes * math.prod(lengths)
+    for number, (item, header) in enumerate(shapes):
+        pixels = max(pixels, header.width * header.height)
+        view = _view_of(item, header.width, header.height)
+        with naming(item.files[1]):
+            width, height = window_of(view)[2:4] if item.undistort else (view.width, view.height)
+        planes = channels + (item.mask is not None or item.alpha_is_mask)
+        for scale in scales:
+            lengths = ((length - length % recipe.multiple) // scale for length in (width, height))
+            sizes[scale, number] = planes * math.prod(lengths)
     return sizes, pixels
+
+
+def warn_of_shapes(shapes: list[tuple[Photograph, Header]]) -> None:
+    """Warns of pictures of another shape than their cameras', for who calls `load_pictures`."""
+    wrong = [(item, header) for item, header in shapes if not header.fits(item.view)]
+    cut = [pair for pair in wrong if pair[1].is_cut(pair[0].view)]
+    for pairs, taken in (
+        (cut, "are taken as cut about the principal point, so that their pixels stay square"),
+        ([pair for pair in wrong if pair not in cut], "are taken as squeezed, so that their pixels are oblong"),
+    ):
+        if pairs:
+            item, header = pairs[0]
+            found = f"{header.width} x {header.height} px of a camera of {item.view.width} x {item.view.height}"
+            counted = counted_files([item.files[1] for item, _ in pairs], len(shapes), "pictures", f"{taken}")
+            text = f"{counted}, {found}: photographs and cameras have different proportions"
+            warnings.warn(SceneWarning(text, "take the photographs for which the cameras were found"), stacklevel=3)
 
 
 def _make(
@@ -221,13 +270,23 @@ def _stored(stored: Stored, item: Photograph, moved: Callable[[Tensor], Tensor])
     return _with_alpha_as_mask(rgba, mask) if item.alpha_is_mask else (rgba, mask)
 
 
-def _read_ahead(items: list[Photograph], scales: tuple[int, ...], threads: int) -> Iterator[dict[int, Stored]]:
-    """What is stored of each photograph at every scale that is needed. Threads read some photographs ahead."""
+def _read_ahead(
+    items: list[Photograph], scales: tuple[int, ...], threads: int
+) -> Iterator[dict[int, Stored] | io.SceneError]:
+    """What is stored of each photograph at every scale that is needed, or why it cannot be read. Threads read some
+    photographs ahead."""
+
+    def read(item: Photograph) -> dict[int, Stored] | io.SceneError:
+        try:
+            return _read_files(item, scales)
+        except io.SceneError as error:
+            return error
+
     with ThreadPoolExecutor(threads, "pictures") as pool:
         ahead: deque = deque()
         try:
             for item in items:
-                ahead.append(pool.submit(_read_files, item, scales))
+                ahead.append(pool.submit(read, item))
                 if len(ahead) > threads:  # more would only wait in memory
                     yield ahead.popleft().result()
             while ahead:
@@ -252,7 +311,8 @@ def fitted(
     """The picture (H, W, 4) of a photograph, its view and its mask (H, W), cut about the centre to multiples of px.
 
     They are undistorted if that is wanted. The principal point moves along. Where the picture is not of the size that
-    the view states, the view is scaled. Where alpha is a mask, the picture becomes opaque.
+    the view states, the view is scaled; where exactly one side differs, it is cut about the principal point. Where
+    alpha is a mask, the picture becomes opaque.
 
     Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
@@ -280,6 +340,10 @@ def _view_of(item: Photograph, width: int, height: int) -> io.View:
             f"{item.files[1]}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x "
             f"{height}"
         )
+    if header.is_cut(view):
+        middle = view.middle if width == view.width else (width / 2, view.middle[1])
+        cx, cy = middle if height == view.height else (middle[0], height / 2)
+        return replace(view, width=width, height=height, cx=cx, cy=cy)
     x, y = width / view.width, height / view.height
     cx, cy = (factor * middle for factor, middle in zip((x, y), view.middle))
     return replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=cx, cy=cy)

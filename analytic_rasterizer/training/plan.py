@@ -3,37 +3,31 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
 from .. import io
 from ..footprints import RECOMMENDED, resolve_footprint
-from . import colmap
-from .captures import IMAGES, check_capture, lens_models, read_cameras
+from .captures import IMAGES, about_folds, lens_models
 from .evidence import (
     LARGEST,
     LEAST_SEEN,
     MOST_PHOTOGRAPHS,
     Evidence,
-    gather,
     interval_ranges,
-    object_stops,
     sharpness_of,
     single_threaded,
     spread_out,
-    stops_of,
 )
-from .extent import outliers_of
 from .layouts import Capture, Photograph
 from .options import as_words, value_in_words
-from .photographs import TURNED, Header, read_header
+from .photographs import TURNED, Header
 from .placement import offset_of
+from .survey import Survey, survey
 
 YES, NO, NOT_KNOWN = "yes", "no", "not known"
 """Verdicts: whether a capture has an effect to an extent that matters."""
@@ -155,24 +149,6 @@ class CapturePlan:
         return values | {"options": {name: value_in_words(value) for name, value in self.options.items()}}
 
 
-class _Survey(NamedTuple):
-    """What is known of a capture after a look at it."""
-
-    capture: Capture
-    items: list[Photograph]  # all of them
-    outliers: dict[int, float]  # places and distances of outlying cameras
-    kept: list[Photograph]  # the others
-    headers: dict[Path, Header]
-    looked_at: list[Photograph]
-    tracked: bool  # tracks say what is visible
-    evidence: Evidence  # of what was looked at
-    stops: dict[Path, torch.Tensor]  # of what was looked at
-
-    @property
-    def points(self) -> torch.Tensor | None:
-        return None if self.capture.points is None else self.capture.points[0]
-
-
 @single_threaded()
 def plan_capture(
     folder,
@@ -189,20 +165,20 @@ def plan_capture(
             px.
 
     Raises:
-        io.SceneError: As `load_capture`, but for missing pictures and lenses; a picture that cannot be read.
+        io.SceneError: As `load_capture`, but for pictures and masks that are missing or cannot be read, and lenses.
         OSError: A file that cannot be read.
         ValueError: `most` is not positive.
     """
     if most < 1:
         raise ValueError(f"most must be at least 1, got {most}")
     folder = Path(folder)
-    found = _survey(folder, images, cameras, most)
+    found = survey(folder, images, cameras, most)
     findings = (
         _lens(found.items),
         *_colors(found),
         *_intervals(found.evidence, found.kept),
         _blur(found.evidence, found.looked_at),
-        _masks(found.capture, found.items),
+        _masks(found.capture, found.items, found.evidence),
         _alpha(found.evidence, found.looked_at),
         *_files([(item, found.headers[item.files[1]]) for item in found.items]),
         _missing(found.capture, folder),
@@ -228,36 +204,9 @@ def stops_of_photographs(
     Raises:
         io.SceneError, OSError: As `plan_capture`.
     """
-    found = _survey(Path(folder), images, cameras, len(files), set(files))
+    found = survey(Path(folder), images, cameras, len(files), set(files))
     unknown = torch.full((3,), math.nan, dtype=torch.float64)
     return torch.stack([found.stops.get(file, unknown) for file in files])
-
-
-def _survey(folder: Path, images: str, cameras: str | None, most: int, among: set[Path] | None = None) -> _Survey:
-    """Reads at most `most` photographs, of all or of those `among` which they are to be."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # findings say it
-        capture = read_cameras(folder, images, 0, cameras, "skip")
-    check_capture(folder, capture)
-    items = sorted([*capture.train, *capture.test], key=lambda item: str(item.files[1]))
-    points = None if capture.points is None else capture.points[0]
-    outliers = outliers_of([item.view for item in items], points)
-    kept = [item for place, item in enumerate(items) if place not in outliers]
-    with ThreadPoolExecutor() as pool:
-        files = [item.files[1] for item in items]
-        headers = dict(zip(files, pool.map(read_header, files)))
-    wanted = [item for item in kept if among is None or item.files[1] in among]
-    fitting = [item for item in wanted if headers[item.files[1]].fits(item.view)]
-    looked_at = spread_out(fitting or wanted, most)
-    from_colmap = points is not None and capture.source is not None and capture.source.is_dir()
-    tracks = colmap.load_tracks(capture.source) if from_colmap else {}
-    evidence = gather(looked_at, points, tracks)
-    if evidence.points:
-        stops = stops_of(evidence)
-    else:
-        stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in looked_at]))
-    stops_by_file = dict(zip((item.files[1] for item in looked_at), stops))
-    return _Survey(capture, items, outliers, kept, headers, looked_at, bool(tracks), evidence, stops_by_file)
 
 
 def _unknown(effect: str, unit: str, reason: str) -> Finding:
@@ -297,6 +246,7 @@ def _lens(items: list[Photograph]) -> Finding:
     keep = {"lens": "keep"}
     largest = max(displacement_of(view) for view in spread_out(list(distinct.values()), MOST_PHOTOGRAPHS))
     which = f"{len(with_lens)} of {len(items)} photographs have a lens ({lens_models(with_lens)})"
+    which = "; ".join([which, *about_folds(with_lens)])
     if math.isinf(largest):
         reason = f"{which}, and show more than a half space, which no pinhole does"
         return Finding("lens", None, "px", YES, reason, keep)
@@ -352,7 +302,7 @@ def _why_unknown(evidence: Evidence) -> str:
     return f"too few points are in {LEAST_SEEN} photographs that were looked at"
 
 
-def _colors(survey: _Survey) -> tuple[Finding, Finding]:
+def _colors(survey: Survey) -> tuple[Finding, Finding]:
     units = {"exposure": "stops", "white balance": "%"}
     evidence, tracked, stops = survey.evidence, survey.tracked, torch.stack(list(survey.stops.values()))
     how, source = "at the same points", "tracks" if tracked else "projected points"
@@ -413,19 +363,28 @@ def _alpha(evidence: Evidence, items: list[Photograph]) -> Finding:
 # ------------------------------------------------------------------------------------ files
 
 
-def _masks(capture: Capture, items: list[Photograph]) -> Finding:
+def _masks(capture: Capture, items: list[Photograph], evidence: Evidence) -> Finding:
     masked = sum(item.mask is not None for item in items)
     verdict, options = (YES, {"masks": "auto"}) if masked else (NO, {})
     reason = f"of {len(items)} have a mask"
+    if masked:
+        reason += f"; of the pixels that were looked at they leave out {1 - evidence.counted.mean().item():.1%}"
+        if not evidence.counted.any():
+            reason += ", so that train has nothing to learn from"
     if capture.ignored_masks:
-        reason += f"; {capture.ignored_masks} files of masks belong to no convention, and are ignored"
+        about = f" ({capture.about_masks})"
+        reason += f"; {capture.ignored_masks} files of masks belong to no convention, and are ignored{about}"
+    if capture.missing_masks:
+        reason += f"; {len(capture.missing_masks)} masks are not there or cannot be read"
     return Finding("masks", masked, "photographs", verdict, reason, options)
 
 
 def _missing(capture: Capture, folder: Path) -> Finding:
-    names = tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in capture.missing)
+    paths = (*capture.missing, *capture.missing_masks)
+    names = tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths)
     verdict, options = (YES, {"missing": "skip"}) if names else (NO, {})
-    return Finding("missing pictures", len(names), "files", verdict, "are not there", options, names)
+    reason = "are not there" if not any(path.is_file() for path in paths) else "are not there, or cannot be read"
+    return Finding("missing pictures", len(names), "files", verdict, reason, options, names)
 
 
 def _files(pairs: list[tuple[Photograph, Header]]) -> tuple[Finding, Finding]:
@@ -441,6 +400,10 @@ def _files(pairs: list[tuple[Photograph, Header]]) -> tuple[Finding, Finding]:
     quarter = sum(header.fits_turned(item.view) for item, header in pairs if not header.fits(item.view))
     reason = "do not have the proportions of their camera"
     if wrong:
-        reason += f"; {quarter} do after a quarter turn, which train refuses; it stretches the camera of the others"
+        cut = sum(header.is_cut(item.view) for item, header in pairs)
+        reason += (
+            f"; {quarter} do after a quarter turn, which train refuses; it takes {cut} for cut about the principal "
+            "point, and stretches the camera of the others"
+        )
     verdict = YES if wrong else NO
     return turns, Finding("wrong sizes", len(wrong), "photographs", verdict, reason, photographs=_names(wrong))

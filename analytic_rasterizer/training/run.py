@@ -38,7 +38,7 @@ from .files import (
     write_json,
     write_scene,
 )
-from .health import finite_rows, small_pictures, warn_of_one_color
+from .health import finite_rows, look_at_pictures
 from .interruption import interruption
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
@@ -47,7 +47,7 @@ from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
 from .source import CaptureSource
 from .start import background_of, begin, of_length
-from .store import PictureMemory, described, processes_here
+from .store import PictureMemory, processes_here
 from .trainer import Trainer
 
 if TYPE_CHECKING:
@@ -134,10 +134,9 @@ class Run:
             io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
         self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)
         if state is None:
-            start, stops = self._begin(source, chosen)
+            stops = self._begin(source, chosen)
         else:
-            start, stops = self._continue(source, state), {}
-        self._make_trainer(start, None if state is None else shards_of(state, ranks))
+            self._continue(source, state)
         if self.trainer.exposures is not None and state is None:
             files = [item.files[1] for item in self.capture.train]
             with self._phase("look"):
@@ -150,8 +149,8 @@ class Run:
         results_folder(self.out)
         self.phases["load"] = time.perf_counter() - began - self.phases["look"]
 
-    def _begin(self, source: CaptureSource, chosen: Collection[str]) -> tuple[Gaussians, Mapping[Path, torch.Tensor]]:
-        """Looks at the capture and loads it. Returns the first Gaussians, and stops of photographs as `settle` has."""
+    def _begin(self, source: CaptureSource, chosen: Collection[str]) -> Mapping[Path, torch.Tensor]:
+        """Looks at the capture, loads it, and makes the trainer. Returns stops of photographs as `settle` has them."""
         found = Settled(self.options, source)
         if self.options.effects == "auto":
             with self._phase("look"):
@@ -160,17 +159,19 @@ class Run:
         with said_first(found.lines):
             self._load_capture(found.source.settled(), found.taken)
             found.source.check_effect(self.capture, chosen)  # raises before the pictures are read
+            found.source.check_out(self.out, self.capture)
             start, self.points_found, self.options, said = begin(self.options, self.capture, source.points, chosen)
             self.notes = [*found.notes, *self.capture.notes, *said]
-        return start, found.stops
+            self._make_trainer(start, None)  # an error of its pictures is one line, too
+        return found.stops
 
-    def _continue(self, source: CaptureSource, state: dict[str, Any]) -> Gaussians:
-        """Loads the capture of a training that is resumed, in its coordinates. Returns the Gaussians of the state."""
+    def _continue(self, source: CaptureSource, state: dict[str, Any]) -> None:
+        """Loads the capture of a training that is resumed, in its coordinates, and makes the trainer."""
         before = state["source"]
         offset = tuple(before.get("offset") or (0.0, 0.0, 0.0))  # earlier versions had none
         self._load_capture(source.settled(before), before.get("taken", {}), offset=offset)
         self.notes, self.points_found = list(self.capture.notes), None
-        return Gaussians(**state["gaussians"])
+        self._make_trainer(Gaussians(**state["gaussians"]), shards_of(state, self.ranks))
 
     def _load_capture(self, source: CaptureSource, taken: Mapping[str, Any], **offset: Any) -> None:
         self.capture = source.load(**offset)
@@ -184,9 +185,7 @@ class Run:
         """
         background = background_of(self.options, self.capture.background)
         pictures = self._load(self.capture.train, background, self.memory)
-        self.notes += [described(pictures.store.plan, self.device)] if pictures.store.plan.ahead else []
-        self.notes += small_pictures(pictures)
-        warn_of_one_color(self.scene, pictures)
+        self.notes += look_at_pictures(self.scene, pictures, self.device)
         if self.ranks.world == 1:
             self.trainer = Trainer(self.options, start, pictures, background, self.device)
         else:

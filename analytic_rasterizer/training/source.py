@@ -91,6 +91,18 @@ class CaptureSource:
         settled = self.settled()
         return {name: getattr(settled, name) for name in READING}
 
+    def check_out(self, out: Path, capture: Capture) -> None:
+        """Raises ValueError for a folder of results that is the capture's own, or one of its pictures.
+
+        Args:
+            out: The folder.
+            capture: What was loaded.
+        """
+        files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
+        own = {Path(self.folder).resolve(), *(path.parent.resolve() for path in files)}
+        if Path(out).resolve() in own:
+            raise ValueError(f"--out must be another folder than the capture and those of its pictures, got {out}")
+
     def check_effect(self, capture: Capture, chosen: Collection[str]) -> None:
         """Raises ValueError if `images` or `test_every` are among the options `chosen`, and change nothing.
 

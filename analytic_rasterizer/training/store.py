@@ -141,17 +141,18 @@ def plan_places(
     plan = Plan(places, taken, ahead, threads)
     on_cpu, making = device.type != "cuda", MAKING * pixels
     on_host = processes * (taken[HOST] + threads * DECODING * pixels + (taken[DEVICE] + making if on_cpu else 0))
-    helps = "larger --scales, smaller photographs (--images) or a lower --picture-memory"
     if on_host > free.host:
-        raise io.SceneError(_too_much(len(sizes), on_host, "memory", free.host, f"{helps}-host"))
+        raise _too_much(len(sizes), on_host, "memory", free.host, "--picture-memory-host")
     if not on_cpu and taken[DEVICE] + making > free.device:
-        raise io.SceneError(_too_much(len(sizes), taken[DEVICE] + making, "the GPU", free.device, f"{helps}-gpu"))
+        raise _too_much(len(sizes), taken[DEVICE] + making, "the GPU", free.device, "--picture-memory-gpu")
     return plan
 
 
-def _too_much(count: int, needed: int, where: str, free: int, helps: str) -> str:
+def _too_much(count: int, needed: int, where: str, free: int, option: str) -> io.SceneError:
     numbers = f"{needed / GIB:.3g} GiB of {where}, where {free / GIB:.3g} GiB are free"
-    return f"the {count} pictures of these photographs at their scales need {numbers}: {helps} may help"
+    message = f"the {count} pictures of these photographs at their scales need {numbers}"
+    helps = "larger --scales or smaller photographs (--images) may help"
+    return io.SceneError(message, helps, f"a lower {option} may help")
 
 
 def described(plan: Plan, device: torch.device) -> str:

@@ -527,8 +527,8 @@ def test_other_programs_read_an_spz_with_an_extension(tmp_path):
 @pytest.mark.parametrize(
     "metadata, lost",
     [
-        (io.SceneMetadata(footprint="moment"), r"the footprint \(give --footprint moment:samples=4 where"),
-        (io.SceneMetadata(antialiased=True), r"the footprint \(give --footprint mip "),
+        (io.SceneMetadata(footprint="moment"), r"the footprint \(`render --footprint moment:samples=4` shows"),
+        (io.SceneMetadata(antialiased=True), r"the footprint \(`render --footprint mip` "),
         (io.SceneMetadata(footprint="point", offset=(1, 2, 3)), r"the offset \(1\.0, 2\.0, 3\.0\) of its positions"),
     ],
 )

@@ -447,7 +447,7 @@ def test_settings_never_vanish():
         ([CAMERA | {"rotation": [1, 2, 3]}], "rotation must hold 3 x 3 finite numbers, got .1, 2"),
         ([CAMERA | {"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}], "must hold a rotation"),
         ([CAMERA | {"position": [1, 2]}], "position must hold 3 finite numbers, got .1, 2"),
-        (without(TRANSFORMS, "fl_x"), "frame 0: expected 'fl_x' or 'camera_angle_x'"),
+        (without(TRANSFORMS, "fl_x"), "frame 0: expected 'fl_x', 'camera_angle_x' or 'K'"),
         (without(TRANSFORMS, "fl_x") | {"camera_angle_x": 4}, "below pi .radians., got 4"),
         (without(TRANSFORMS, "h"), "frame 0: missing 'h'"),
         (without(TRANSFORMS, "w", "h"), "no image size: expected 'w' and 'h', a picture at"),

@@ -179,7 +179,10 @@ def test_a_capture_that_cannot_be_looked_at(even, tmp_path, capsys, monkeypatch)
     """Its loader says what is wrong, if anything is."""
     shutil.copytree(even, tmp_path / "wall")
     (tmp_path / "wall" / "images" / "p_3.png").write_bytes(b"no picture")
-    assert "p_3.png: unreadable" in refused(capsys, train, tmp_path / "wall", tmp_path / "out")
+    where = tmp_path / "wall", tmp_path / "out"
+    assert "p_3.png: unreadable" in refused(capsys, train, *where, "--missing", "refuse")
+    assert train(*where, "--no-evaluate") == 0
+    assert "1 of 10 pictures cannot be read and left out" in capsys.readouterr().err
 
     def fail(*args, **options):
         raise RuntimeError("a look went wrong")

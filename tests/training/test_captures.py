@@ -29,7 +29,8 @@ from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, render_stages, training
-from analytic_rasterizer.training import captures, colmap, files, photographs, pictures, placement, run, undistortion
+from analytic_rasterizer.training import captures, colmap, files, photographs, pictures, placement, undistortion
+from analytic_rasterizer.training.start import first_gaussians
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
 
@@ -277,7 +278,7 @@ def test_masks_of_nerfstudio(tmp_path):
             frame["mask_path"] = name
 
     write_nerfstudio(tmp_path, add_masks)
-    with pytest.raises(io.SceneError, match=r"frame 0: mask_path must name a picture beside the file, got .*r\.png"):
+    with pytest.raises(io.SceneError, match=r"1 of 1 masks that mask_path names are missing, .*r\.png; --masks none"):
         training.load_capture(tmp_path)
     write_grey(tmp_path / "masks", circle(1, (35, 33)), ["r.png"])
     found = training.load_capture(tmp_path)
@@ -737,7 +738,7 @@ FOUND = {
     ),
     "missing pictures": (
         lambda f: without(f, "images/r_3.png", "images/r_5.png"),
-        r"2 of 9 pictures are missing, the first is .*r_3.png \(--missing skip leaves them out\)",
+        r"2 of 9 pictures are missing, the first is .*r_3.png; --missing skip leaves them out",
     ),
     "no folder of pictures": (
         lambda f: [write(f), moved(f, "images", "input")],
@@ -959,12 +960,12 @@ def test_files_of_a_far_training_have_one_frame(tmp_path, capsys):
     # A start from a scene or from points in the world comes to the same places.
     write_points(tmp_path / "world.ply", [[500000.25, 4200000.5, 120.125], [500001, 4200000, 119]], "double")
     capture = training.load_capture(tmp_path / "far")
-    first, _ = run.first_gaussians(training.TrainingOptions(), capture, tmp_path / "world.ply")
+    first, _ = first_gaussians(training.TrainingOptions(), capture, tmp_path / "world.ply")
     assert first.means.tolist() == [[0.25, 0.5, 0.125], [1, 0, -1]]
-    again, _ = run.first_gaussians(training.TrainingOptions(), capture, out / files.SCENE)
+    again, _ = first_gaussians(training.TrainingOptions(), capture, out / files.SCENE)
     assert torch.equal(again.means, scenes["far"][0].means)
     moved_capture = capture._replace(offset=(500001.0, 4200000.0, 120.0))
-    again, _ = run.first_gaussians(training.TrainingOptions(), moved_capture, out / files.SCENE)
+    again, _ = first_gaussians(training.TrainingOptions(), moved_capture, out / files.SCENE)
     torch.testing.assert_close(again.means, scenes["far"][0].means - torch.tensor([1.0, 0, 0]), rtol=0, atol=1e-6)
 
 
@@ -1076,7 +1077,7 @@ def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
     found = training.load_capture(tmp_path)
     assert found.offset == (500123.5, 4200456.8, 99.9) and not found.starts_in_view
     options = training.TrainingOptions(random_points=50)
-    start, _ = run.first_gaussians(options, found, None)
+    start, _ = first_gaussians(options, found, None)
     expected = training.random_points(50, 0)[0].double() + torch.tensor(place, dtype=torch.float64)
     in_world = start.means.double() + torch.tensor(found.offset, dtype=torch.float64)
     torch.testing.assert_close(in_world, expected, rtol=0, atol=1e-5)

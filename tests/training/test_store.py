@@ -348,9 +348,9 @@ def unread(monkeypatch):
 
 def test_what_does_not_fit_is_said_before_anything_is_decoded(synthetic, monkeypatch, unread):
     capture = training.load_capture(synthetic)
-    helps = r"larger --scales, smaller photographs \(--images\) or a lower --picture-memory"
+    helps = r"larger --scales or smaller photographs \(--images\) may help; a lower --picture-memory"
     monkeypatch.setattr(pictures, "free_memory", lambda _: Bytes(GIB, 1024))
-    expected = rf"the 12 pictures of .* need [\d.e-]+ GiB of memory, where 9.54e-07 GiB are free: {helps}-host may help"
+    expected = rf"the 12 pictures of .* need [\d.e-]+ GiB of memory, where 9.54e-07 GiB are free; {helps}-host may help"
     with pytest.raises(io.SceneError, match=expected):
         training.load_pictures(capture.train, (1, 2), capture.background, "cpu")
     sizes = {(1, i): 12_000_000 * 3 for i in range(1000)}
@@ -359,7 +359,7 @@ def test_what_does_not_fit_is_said_before_anything_is_decoded(synthetic, monkeyp
         (Bytes(GIB // 2, 100 * GIB), Bytes(0, 40 * GIB), "the GPU, where 0.5 GiB", "gpu"),
         (Bytes(80 * GIB, 20 * GIB), Bytes(0, 40 * GIB), "memory, where 20 GiB", "host"),
     ):
-        with pytest.raises(io.SceneError, match=rf"need .* GiB of {where} are free: {helps}-{option} may help"):
+        with pytest.raises(io.SceneError, match=rf"need .* GiB of {where} are free; {helps}-{option} may help"):
             store.plan_places(sizes, 12_000_000, limits, free, torch.device("cuda"))
 
 
