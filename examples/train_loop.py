@@ -18,7 +18,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import io, training
 
 FOOTPRINT = "moment:samples=4"
-FIRST, FIRST_SHARE = "box:samples=1", 0.9  # one sample is quicker, and enough while shapes are being found
+FIRST, FIRST_SHARE = "box:samples=1", 0.9  # one sample is quicker, and mostly enough while shapes are being found
 
 
 def own_pictures(device):

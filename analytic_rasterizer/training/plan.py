@@ -47,9 +47,10 @@ NAMED = 5  # photographs in a line
 
 SCALES = (1, 2, 4, 8)
 
-# While shapes are being found, one sample in a pixel does as well as many: until such a share of the training, where
-# photographs have one size, and where edges are finer than a pixel (docs/internals/training.md).
+# While shapes are being found, one sample in a pixel does as well as many: until such a share of the training where
+# photographs show most points at one size, and where edges are finer than a pixel (docs/internals/training.md).
 CHEAP, CHEAP_UNTIL, CHEAP_UNTIL_FINE = "box:samples=1", 0.9, 0.5
+MOST_VARIED = 50.0  # percent of points whose sampling intervals differ, up to which it does
 DEAR = ("analytic", "box", "moment")  # footprints that integrate over the same pixel
 
 
@@ -121,14 +122,14 @@ class CapturePlan:
         return {name: value for options in called_for for name, value in options.items()}
 
     def beginning(self, footprint: str, scales: Sequence[int]) -> dict[str, Any]:
-        """Options of `train` for a cheaper footprint at the beginning, where a training for `footprint` may have one.
-
-        Args:
-            scales: Of the training. Pictures of several sizes, or with alpha, show edges finer than a pixel.
-        """
+        """Options of `train` for a cheaper footprint at the beginning of a training for `footprint` at such scales."""
         if resolve_footprint(footprint).name not in DEAR or footprint == CHEAP:
             return {}
-        fine = len(scales) > 1 or any(f.effect == "alpha" and f.verdict == YES for f in self.findings)
+        found = {finding.effect: finding for finding in self.findings}
+        share, alpha = found["sampling"].number, found["alpha"].verdict == YES
+        if not alpha and (share is None or share > MOST_VARIED):
+            return {}
+        fine = alpha or len(scales) > 1  # edges finer than a pixel
         return {"first_footprint": CHEAP, "footprint_from": CHEAP_UNTIL_FINE if fine else CHEAP_UNTIL}
 
     def to_lines(self) -> list[str]:
@@ -138,9 +139,11 @@ class CapturePlan:
 
     def to_text(self) -> str:
         """`to_lines`, and the options."""
-        begins = as_words(self.beginning(RECOMMENDED, self.options.get("scales", (1,))))
-        wanted = as_words(self.options) or "nothing special"
-        return "\n".join([*self.to_lines(), f"training begins with: {begins}", f"calls for: {wanted}"])
+        lines, wanted = self.to_lines(), as_words(self.options) or "nothing special"
+        beginning = self.beginning(RECOMMENDED, self.options.get("scales", (1,)))
+        if beginning:
+            lines.append(f"training may begin with: {as_words(beginning)}")
+        return "\n".join([*lines, f"calls for: {wanted}"])
 
     def to_json(self) -> dict[str, Any]:
         """Everything but `stops`, as JSON holds it; options in words."""

@@ -155,12 +155,13 @@ def test_its_images_are_ours_and_those_of_splatfacto_are_not(run):
 
 
 def test_a_training_begins_with_the_cheaper_footprint(run):
-    """Until nine tenths of its steps. Evaluation, and a model that nobody trains, have the other one."""
+    """Where it is asked for, until nine tenths of its steps. Evaluation has the other one."""
     run("""
     from types import SimpleNamespace
     from nerfstudio.configs.method_configs import all_methods
     from analytic_rasterizer.dialects.gsplat import rasterization
-    config = dataclasses.replace(all_methods["splatfacto-analytic"].pipeline.model, footprint="point:dilation=0")
+    named = {"footprint": "point:dilation=0", "first_footprint": "box:samples=1"}
+    config = dataclasses.replace(all_methods["splatfacto-analytic"].pipeline.model, **named)
     cheap, dear = (rasterization(*camera, 9, 9, footprint=f)[0] for f in ("box:samples=1", "point:dilation=0"))
     assert not torch.equal(cheap, dear)
     model = config._target(config)

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import warnings
+from dataclasses import replace
 
 import commands
 import pytest
@@ -113,9 +114,9 @@ def test_scales_that_photographs_call_for(tmp_path):
     views = cameras(lambda i: 4.0 if i % 2 else 19.0)
     settled = settle(write_wall(tmp_path, views))
     assert settled.taken == {"scales": (1, 2, 4, 8)} and settled.source.lens is None
-    assert settled.options == TrainingOptions(scales=(1, 2, 4, 8), **BEGINNING | {"footprint_from": 0.5})
+    assert settled.options == TrainingOptions(scales=(1, 2, 4, 8))
     assert settle(tmp_path, TrainingOptions(scales=(1, 2))).taken == {}
-    assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions(**BEGINNING)
+    assert settle(tmp_path, chosen=["scales"]).options == TrainingOptions()
 
 
 @pytest.mark.parametrize(
@@ -150,6 +151,15 @@ def test_what_a_training_begins_with(even, tmp_path, given, expected, capsys):
         seen.append(run.trainer.footprint)
         run.trainer.step()
     assert seen == [expected[0]] * until + [run.options.footprint] * (20 - until)
+
+
+@pytest.mark.parametrize("share, begins", [(20.0, True), (70.0, False), (None, False)])
+def test_photographs_that_show_points_at_many_sizes_do_not_begin_with_it(even, share, begins):
+    """Nor those without points, of which nobody knows."""
+    found = plan.plan_capture(even)
+    findings = [replace(f, number=share) if f.effect == "sampling" else f for f in found.findings]
+    beginning = replace(found, findings=tuple(findings)).beginning("moment:samples=4", (1,))
+    assert beginning == (BEGINNING if begins else {})
 
 
 def test_photographs_with_alpha_begin_with_it_for_a_shorter_time(tmp_path):

@@ -1000,7 +1000,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     said = notes_of(capsys.readouterr().err)
     assert re.search(EXACT % "perspective", "\n".join(said))
     assert said[-1] == "no points in the capture: starts from 50 random ones in the views (--points)"
-    assert said[-2].startswith("at most 1,000 Gaussians, as many as ") and len(said) == 4
+    assert said[-2].startswith("at most 1,000 Gaussians, as many as ") and len(said) == 3
     assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
     assert commands.evaluate(tmp_path / "kept") == 0
     assert json.loads((tmp_path / "kept" / "evaluation.json").read_text())["resampled"] == 0
@@ -1008,7 +1008,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     options = ["--lens", "undistort", "--iterations", "1", "--random-points", "50"]
     assert train(tmp_path / "scene", tmp_path / "out", *options) == 0
     said = notes_of(capsys.readouterr().err)
-    assert re.search(RESAMPLED % "perspective", "\n".join(said)) and len(said) == 4
+    assert re.search(RESAMPLED % "perspective", "\n".join(said)) and len(said) == 3
     assert commands.evaluate(tmp_path / "out") == 0
     assert re.search(RESAMPLED % "perspective", capsys.readouterr().err)
     assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["resampled"] == 2

@@ -19,8 +19,6 @@ from nerfstudio.models import splatfacto
 from ...footprints import RECOMMENDED, resolve_footprint
 from .patching import rasterization_of_installed
 
-CHEAP = "box:samples=1"  # while shapes are being found, one sample in a pixel does as well as many
-
 NAME = "splatfacto-analytic"
 
 _FOOTPRINT: ContextVar[str | None] = ContextVar("_FOOTPRINT", default=None)
@@ -34,7 +32,7 @@ class SplatfactoAnalyticModelConfig(splatfacto.SplatfactoModelConfig):
     Attributes:
         footprint: Weight of a Gaussian in a pixel: a footprint of analytic_rasterizer, with its options. It replaces
             rasterize_mode, which must be left as it is.
-        first_footprint: Cheaper one, for the steps before; `footprint` from the start where it is the same.
+        first_footprint: Cheaper one for the steps before, such as "box:samples=1"; None: `footprint` from the start.
         footprint_from: Share of the training from which on `footprint` is used, 0 to 1.
 
     Raises:
@@ -43,11 +41,11 @@ class SplatfactoAnalyticModelConfig(splatfacto.SplatfactoModelConfig):
 
     _target: type = dataclasses.field(default_factory=lambda: SplatfactoAnalyticModel)
     footprint: str = RECOMMENDED
-    first_footprint: str = CHEAP
+    first_footprint: str | None = None
     footprint_from: float = 0.9
 
     def __post_init__(self) -> None:
-        for footprint in (self.footprint, self.first_footprint):
+        for footprint in filter(None, (self.footprint, self.first_footprint)):
             resolve_footprint(footprint)
         if not 0 <= self.footprint_from <= 1:
             raise ValueError(f"footprint_from must be 0 to 1, got {self.footprint_from}")
@@ -81,8 +79,9 @@ class SplatfactoAnalyticModel(splatfacto.SplatfactoModel):
 
     def get_outputs(self, camera: Any) -> Any:
         """As splatfacto's. `camera` is one of nerfstudio's."""
-        cheap = self._dear_from > 0 and self.training and self.step < self._dear_from
-        token = _FOOTPRINT.set(self.config.first_footprint if cheap else self.config.footprint)
+        first = self.config.first_footprint
+        cheap = first is not None and self.training and self.step < self._dear_from
+        token = _FOOTPRINT.set(first if cheap else self.config.footprint)
         try:
             return super().get_outputs(camera)
         finally:
