@@ -258,6 +258,15 @@ def test_where_webgpu_shows_black_webgl_draws(browser, broken, why):
         assert page.is_hidden("#message")
 
 
+def test_a_compact_scene_that_stays_black_is_a_sentence(browser):
+    scene = random_scene(200).with_activated(scales=torch.full((200, 3), 0.1))
+    with serve(scene, [facing()], compact=True) as server, open_gpu(browser, server, init=NOTHING_SHOWN) as page:
+        page.wait_for_selector("#message p")
+        assert page.inner_text("#message") == (
+            "A compact scene needs WebGPU. WebGL 2 would draw: WebGPU failed here. The page stayed black."
+        )
+
+
 @pytest.mark.parametrize("scene", ["dark", "behind", "tiny"])
 def test_what_is_black_by_right_stays_with_webgpu(browser, scene):
     made = random_scene(100).with_activated(scales=torch.full((100, 3), 1e-5 if scene == "tiny" else 0.1))

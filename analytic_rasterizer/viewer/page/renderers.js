@@ -28,8 +28,8 @@ function freshCanvas() {
 
 /// The renderer for a scene, and why it is not WebGPU, or ''. Throws an Error with a sentence where there is none.
 /// `wish` is `renderer` of the address: 'webgpu' also takes a device that is only software, 'webgl' takes WebGL 2.
-export async function openRenderer(meta, wish) {
-  let reason = 'the address asks for it.';
+/// `reason` is why 'webgl' is wished for.
+export async function openRenderer(meta, wish, reason = 'the address asks for it.') {
   if (wish !== 'webgl') {
     try {
       return { renderer: await WebGPURenderer.create(freshCanvas(), meta, wish === 'webgpu'), reason: '' };

@@ -39,9 +39,9 @@ export class Viewer {
     this.settledTime = 0;  // ms
   }
 
-  /// Opens a renderer for the scene, which is not here yet.
-  async open() {
-    Object.assign(this, await openRenderer(this.meta, this.wish));
+  /// Opens a renderer for the scene, which is not here yet. `reason` is that of openRenderer.
+  async open(reason) {
+    Object.assign(this, await openRenderer(this.meta, this.wish, reason));
     this.renderer.progress = (what, done, of) => this.noteProgress(what, done, of);
   }
 
@@ -83,10 +83,9 @@ export class Viewer {
     this.shown = null;
     if (!(renderer instanceof WebGLRenderer)) this.losses += 1;
     if (failure || this.losses > 1) this.wish = 'webgl';
+    const lost = this.losses > 1 ? 'WebGPU lost the graphics device twice.' : undefined;
     try {
-      await this.open();
-      if (failure) this.reason = `WebGPU failed here. ${failure.message}`;
-      else if (this.losses > 1) this.reason = 'WebGPU lost the graphics device twice.';
+      await this.open(failure ? `WebGPU failed here. ${failure.message}` : lost);
       await this.load(this.scene);
     } catch (error) {
       showFailure(error.message);
@@ -261,7 +260,7 @@ export class Viewer {
     try {
       done = await this.drawFrame();
     } catch (error) {
-      if (!await this.wasLost(renderer)) this.replace(renderer, error).catch(() => showFailure(error.message));
+      if (!await this.wasLost(renderer)) this.replace(renderer, error).catch(last => showFailure(last.message));
       return;  // another renderer wakes the loop
     } finally {
       this.drawing = false;
