@@ -434,3 +434,16 @@ def test_all_of_a_pictures_pixels_count_once_in_what_masks_leave_out(tmp_path):
     for scales in ((1,), (1, 2)):
         shares = training.load_pictures(capture.train, scales, (0.0,) * 3, "cpu").shares
         assert shares == [0, 0, *[1] * 7]
+
+
+def test_commands_make_the_folders_of_their_files(tmp_path):
+    """And say that they cannot before the scene is read."""
+    write(tmp_path / "capture")
+    start = training.starting_gaussians(training.TrainingOptions(random_points=9, sh_degree=0), None)
+    io.save_scene(tmp_path / "scene.ply", start)
+    written = [tmp_path / "new" / "plan.json", tmp_path / "newer" / "page.html"]
+    assert commands.command("inspect", tmp_path / "capture", "--json", written[0]) == 0
+    assert commands.command("view", tmp_path / "scene.ply", "--export", written[1]) == 0
+    assert all(path.is_file() for path in written)
+    (tmp_path / "file").write_text("")
+    assert commands.command("view", tmp_path / "none.ply", "--export", tmp_path / "file" / "page.html") == 2
