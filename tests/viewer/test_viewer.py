@@ -449,7 +449,7 @@ def test_the_background_is_that_of_the_file(files):
         ("scene.ply --export out.txt", "--export must end in .html"),
         ("scene.ply --export out.html --port 8000", "--port is for serving"),
         ("scene.ply --export out.html --device cpu", "--device and --threads are for --server"),
-        ("scene.ply --export missing/out.html", "No such file or directory"),
+        ("scene.ply --export scene.ply/out.html", "scene.ply: expected a folder for the results, got a file"),
         ("broken.ply", "broken.ply"),
         ("empty.ply", "no Gaussians"),
         ("broken.spz", "broken.spz"),
