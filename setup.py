@@ -105,24 +105,19 @@ if WITH_CUDA:
 else:
     SOURCES = [source for source in SOURCES if not source.endswith("_cuda.cpp")]
 
-# What is compiled in one piece with others, by folder and name: torch's headers take longer to read than these files to
-# compile. The first two read more of them than the others need. What needs CUDA's headers is compiled by itself.
-FIRST_UNIT = ("csrc/torch/autograd.cpp", "csrc/torch/rasterize.cpp")
-
 
 def in_units(sources: list[str], folder: Path) -> list[str]:
-    """The sources, those of csrc/torch replaced by files in `folder` that include them."""
+    """The sources, those of csrc/torch replaced by a file in `folder` that includes them.
+
+    Torch's headers take longer to read than these files to compile. What needs CUDA's headers is compiled by itself.
+    """
     of_torch = [source for source in sources if re.fullmatch(r"csrc/torch/.*(?<!_cuda)\.cpp", source)]
-    rest = [source for source in of_torch if source not in FIRST_UNIT]
-    units = []
-    for number, unit in enumerate((FIRST_UNIT, rest)):
-        path = folder / f"torch_{number}.cpp"
-        text = "".join(f'#include "{Path(source).relative_to("csrc")}"\n' for source in unit)
-        if not path.exists() or path.read_text() != text:  # a new file would be compiled again
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-        units.append(os.path.relpath(path, ROOT))
-    return units + [source for source in sources if source not in of_torch]
+    text = "".join(f'#include "{Path(source).relative_to("csrc")}"\n' for source in of_torch)
+    path = folder / "torch.cpp"
+    if not path.exists() or path.read_text() != text:  # a new file would be compiled again
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return [os.path.relpath(path, ROOT), *(source for source in sources if source not in of_torch)]
 
 
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must

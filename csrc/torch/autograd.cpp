@@ -17,14 +17,14 @@ using torch::autograd::variable_list;
 using torch::jit::Stack;
 
 /// What the schemas say, as indices of arguments.
-struct Op {
+struct DifferentiableOp {
   c10::OperatorHandle forward, vjp;
   std::vector<size_t> tensors;
   std::vector<size_t> lists;  ///< Of tensors, without gradient.
   size_t arguments, outputs;
   std::optional<size_t> keep;  ///< Makes the op save what its adjoint needs.
 
-  explicit Op(const c10::OperatorHandle& op)
+  explicit DifferentiableOp(const c10::OperatorHandle& op)
       : forward(op),
         vjp(c10::Dispatcher::singleton().findSchemaOrThrow((op.schema().name() + "_vjp").c_str(), "")),
         arguments(op.schema().arguments().size()),
@@ -46,8 +46,8 @@ bool is_given(const IValue& value) { return value.isTensor() && value.toTensor()
 
 struct Node : torch::autograd::Function<Node> {
   /// The node of an op that has run. Returns the tensors of all results; result k has sizes[k].
-  static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, const Stack* arguments,
-                               const Stack* results, std::vector<int64_t>* sizes) {
+  static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const DifferentiableOp* op,
+                               const Stack* arguments, const Stack* results, std::vector<int64_t>* sizes) {
     Stack others = *arguments;  // Without tensors, which autograd saves.
     std::vector<bool> given;
     for (const size_t i : op->tensors) {
@@ -89,7 +89,7 @@ struct Node : torch::autograd::Function<Node> {
   }
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
-    const Op* op = reinterpret_cast<const Op*>(intptr_t(ctx->saved_data["op"].toInt()));
+    const DifferentiableOp* op = reinterpret_cast<const DifferentiableOp*>(intptr_t(ctx->saved_data["op"].toInt()));
     const auto given = ctx->saved_data["given"].toBoolList();
     const size_t differentiable = size_t(ctx->saved_data["differentiable"].toInt());
     const variable_list saved = ctx->get_saved_variables();
@@ -133,7 +133,7 @@ struct Node : torch::autograd::Function<Node> {
   }
 };
 
-bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
+bool wants_gradient(const DifferentiableOp& op, const Stack& stack, size_t first) {
   if (!at::GradMode::is_enabled()) return false;
   for (const size_t i : op.tensors) {
     const IValue& value = stack[first + i];
@@ -145,7 +145,7 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
 std::atomic<bool> any_required = false;
 
 /// torch.func allows no C++ nodes.
-void refuse_transforms(const Op& op) {
+void refuse_transforms(const DifferentiableOp& op) {
   TORCH_CHECK_NOT_IMPLEMENTED(
       !c10::impl::tls_is_dispatch_key_included(c10::DispatchKey::FuncTorchDynamicLayerBackMode),
       op.forward.schema().name(),
@@ -153,7 +153,7 @@ void refuse_transforms(const Op& op) {
 }
 
 /// Forward mode would drop tangents silently.
-void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
+void refuse_tangents(const DifferentiableOp& op, const Stack& stack, size_t first) {
   for (const size_t i : op.tensors) {
     const IValue& value = stack[first + i];
     TORCH_CHECK_NOT_IMPLEMENTED(!is_given(value) || !value.toTensor()._fw_grad(/*level=*/0).defined(),
@@ -164,13 +164,13 @@ void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
 
 void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
   // Never freed. A schema keeps its address.
-  static auto* ops = new std::unordered_map<const c10::FunctionSchema*, std::unique_ptr<Op>>;
+  static auto* ops = new std::unordered_map<const c10::FunctionSchema*, std::unique_ptr<DifferentiableOp>>;
   static auto* mutex = new std::mutex;
-  const Op* op = nullptr;
+  const DifferentiableOp* op = nullptr;
   {
     const std::lock_guard lock(*mutex);
-    std::unique_ptr<Op>& entry = (*ops)[&handle.schema()];
-    if (!entry) entry = std::make_unique<Op>(handle);
+    std::unique_ptr<DifferentiableOp>& entry = (*ops)[&handle.schema()];
+    if (!entry) entry = std::make_unique<DifferentiableOp>(handle);
     op = entry.get();
   }
   const size_t first = stack->size() - op->arguments;
