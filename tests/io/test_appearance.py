@@ -391,7 +391,8 @@ def test_render_shows_a_model_as_it_was_trained(model, tmp_path, capsys):
     for view in make_views():
         expected = shown(io.load_scene(model.parent / DEEP), view, "point", io.WHITE)
         assert np.abs(picture(tmp_path / "out" / f"{view.name}.png") - expected).max() <= 1
-    where, choice = capsys.readouterr().err.splitlines()
+    where, choice, size = capsys.readouterr().err.splitlines()
+    assert size == "pictures of 64x48"
     assert where == (
         f"from {model}: {model.parent / DEEP}; 2 views of {model / 'cameras.json'}, 64x48; the size of the training "
         "(cfg_args: resolution 4); background white (cfg_args)"
@@ -428,7 +429,8 @@ def test_a_baked_scene_is_shown_with_moment_and_not_baked_again(model, tmp_path,
     assert run(["bake", str(model), "--out", str(baked)]) == 0
     views = ["--views", str(model / "cameras.json"), "--scales", "4"]
     assert run(["render", str(baked), *views, "--out", str(tmp_path / "out")]) == 0
-    assert capsys.readouterr().err.endswith(f"footprint moment:samples=4: {name} says so\n")
+    said = "pictures of 64x48: 1/4 of the 256x192 of the views\n"
+    assert capsys.readouterr().err.endswith(f"footprint moment:samples=4: {name} says so\n{said}")
     expected = shown(io.load_scene(baked), make_views()[0], "moment:samples=4", io.BLACK)
     assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
     assert run(["bake", str(baked), *views, "--out", str(tmp_path / "twice.ply")]) == 2
@@ -442,7 +444,7 @@ def test_a_scene_of_mip_splatting_is_shown_with_its_filter_and_not_baked(tmp_pat
     model = tmp_path / "MODEL"
     assert run(["render", str(model), "--out", str(tmp_path / "out")]) == 0
     reason = "cfg_args says kernel_size 0.2, the variance of Mip-Splatting's filter"
-    assert capsys.readouterr().err.endswith(f"footprint mip:variance=0.2: {reason}\n")
+    assert capsys.readouterr().err.endswith(f"footprint mip:variance=0.2: {reason}\npictures of 64x48\n")
     expected = shown(make_scene(degree=0), make_views()[0], "mip:variance=0.2", io.BLACK)
     assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
     assert run(["bake", str(model), "--out", str(tmp_path / "b.ply")]) == 2
