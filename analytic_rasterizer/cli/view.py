@@ -38,6 +38,9 @@ def add_parser(subcommands) -> None:
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
     )
     parser.add_argument(
+        "--exact", action="store_true", help="export all numbers as they are, in a file five times as large"
+    )
+    parser.add_argument(
         "--compact", action="store_true", help="half of the memory: harmonics of 8 bits, for browsers with WebGPU only"
     )
     parser.add_argument(
@@ -64,6 +67,8 @@ def run(args) -> None:
         check_writable_file(args.export)
     if args.export is not None and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")
+    if args.exact and args.export is None:
+        raise ValueError("--exact is for --export: what is served is not rounded")
     if args.footprint is not None:  # raises before the scene is read
         try:
             viewer.page_footprint(resolve_footprint(args.footprint))
@@ -75,7 +80,7 @@ def run(args) -> None:
     packed, chosen = pack(args, found, views, args.background)
     said.append(chosen)
     if args.export is not None:
-        size = viewer.export_page(args.export, packed)
+        size = viewer.export_page(args.export, packed, exact=args.exact)
         say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
@@ -110,6 +115,8 @@ def run_live(args) -> None:
     """Renders for browsers until interrupted."""
     if args.export is not None:
         raise ValueError("--export writes the page that needs no server: leave out --server")
+    if args.exact:
+        raise ValueError("--exact is for the page that --export writes: leave out --server")
     if args.compact:
         raise ValueError("--compact is for the memory of the browser: leave out --server")
     given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read

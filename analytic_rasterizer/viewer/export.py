@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
+import json
 import re
 
 from ..io import write_bytes
+from .compressed import compress
 from .packing import PackedScene
 from .pages import MODULES, WORKER, content_security_policy, page_file
 
@@ -15,10 +17,15 @@ MAX_EMBEDDED = 500_000_000
 """Characters of an array in an exported file: browsers hold no longer string."""
 
 
-def export_page(path, scene: PackedScene) -> int:
+def export_page(path, scene: PackedScene, *, exact: bool = False) -> int:
     """Writes the page and the scene into one file, `path`, and returns its size in bytes.
 
     The file loads nothing: its Content-Security-Policy allows the hashes of its own script and style and no connection.
+
+    Args:
+        scene: What `pack_scene` returned.
+        exact: Keep all numbers as they are. Otherwise they are rounded (`compressed.py`), and the file has about a
+            fifth of the size. Compact scenes are always kept.
 
     Raises:
         ValueError: A scene too large for one file.
@@ -28,10 +35,16 @@ def export_page(path, scene: PackedScene) -> int:
     policy = content_security_policy(
         script=_source_hash(script), style=_source_hash(style), connect="'none'", worker="blob:"
     )
+    meta = scene.meta
+    if exact or meta["compact"] is not None:
+        arrays = {"geometry": _zipped(scene.geometry), "harmonics": _zipped(scene.harmonics)}
+    else:
+        compressed, columns = compress(scene)
+        meta = meta | {"compressed": compressed}
+        arrays = {"columns": columns}
     data = [
-        _element("scene", "application/json", scene.meta_json().decode().replace("<", "\\u003c")),
-        _element("geometry", "application/octet-stream", _compressed(scene.geometry)),
-        _element("harmonics", "application/octet-stream", _compressed(scene.harmonics)),
+        _element("scene", "application/json", json.dumps(meta, allow_nan=False).replace("<", "\\u003c")),
+        *(_element(name, "application/octet-stream", _text(array)) for name, array in arrays.items()),
         _element("sorter", "text/plain", page_file(WORKER)),
     ]
     html = page_file("index.html")
@@ -63,8 +76,12 @@ def bundle(names) -> str:
     return "\n".join(parts)
 
 
-def _compressed(data: bytes) -> str:
-    text = base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
+def _zipped(data: bytes) -> bytes:
+    return gzip.compress(data, 6, mtime=0)
+
+
+def _text(data: bytes) -> str:
+    text = base64.b64encode(data).decode()
     if len(text) > MAX_EMBEDDED:
         raise ValueError(
             f"the scene is too large for one file: an array takes {len(text) / 1e6:.0f} MB, and browsers hold "

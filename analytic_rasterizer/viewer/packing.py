@@ -84,7 +84,7 @@ class PackedScene:
             default, kind (kPage of its header), samples, variance of its Gaussians [px^2], and the name of its option
             where that is another variance. `instead` is what is drawn while the camera moves, and where there is no
             WebGPU; null: the footprint itself. `compared` are names of footprints that the key C compares with: the
-            first that can be drawn and is not chosen.
+            first that can be drawn and is not chosen. An exported file adds `compressed` (`compressed.py`).
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),

@@ -17,6 +17,7 @@ MODULES = (
     "present.wgsl.js",
     "webgpu_passes.js",
     "webgpu.js",
+    "compressed.js",
     "load.js",
     "webgl_tools.js",
     "webgl_shaders.js",

@@ -47,6 +47,14 @@ def serve(scene, views, photographs=None, opens=None, **options):
         thread.join()
 
 
+def gaussians_of(packed):
+    """The scene that `pack_scene` packed, not compact."""
+    geometry = torch.frombuffer(bytearray(packed.geometry), dtype=torch.float32).reshape(-1, 12)
+    harmonics = torch.frombuffer(bytearray(packed.harmonics), dtype=torch.float16).reshape(len(geometry), -1).float()
+    shs = harmonics[:, : 3 * (packed.meta["sh_degree"] + 1) ** 2].unflatten(1, (-1, 3))
+    return Gaussians.from_activated(geometry[:, :3], geometry[:, 4:7], geometry[:, 8:], geometry[:, 3:4], shs)
+
+
 def rendered(scene, view, footprint, background=(0.0, 0.0, 0.0)):
     settings = view.settings(1.0, background, scene.sh_degree, footprint)
     return render_stages(settings, **scene.arguments()).color.numpy()

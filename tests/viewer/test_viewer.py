@@ -6,8 +6,6 @@ import hashlib
 import http.client
 import json
 import re
-import shutil
-import subprocess
 import threading
 from io import BytesIO
 
@@ -18,6 +16,7 @@ import torch
 from capture_files import circle, write_colmap, write_pictures
 from commands import refused
 from gaussians import make_scene, make_view
+from node import run_node
 from pages import serve
 from places import ROOT
 from processes import DEADLINE
@@ -28,6 +27,7 @@ from analytic_rasterizer.cli.photographs import find_photographs
 from analytic_rasterizer.footprints import footprint_variants
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import pages
+from analytic_rasterizer.viewer.compressed import compress
 
 CORE = ROOT / "csrc" / "core"
 JAVASCRIPT = (*pages.MODULES, pages.WORKER)
@@ -323,29 +323,36 @@ def test_a_port_in_use_is_one_sentence(server):
 # ------------------------------------------------------------------------------ exported file
 
 
-@pytest.fixture
-def exported(tmp_path):
+@pytest.fixture(params=[True, False], ids=["exact", "compressed"])
+def exported(request, tmp_path):
+    """What was exported, the text of the file, and whether its numbers are exact."""
     packed = viewer.pack_scene(make_scene(), [make_view("</script><b>")], name="<script>alert(1)</script>")
-    size = viewer.export_page(tmp_path / "scene.html", packed)
+    size = viewer.export_page(tmp_path / "scene.html", packed, exact=request.param)
     text = (tmp_path / "scene.html").read_text(encoding="utf-8")
     assert size == len(text.encode())
-    return packed, text
+    return packed, text, request.param
 
 
 def test_the_exported_file_holds_the_scene(exported):
-    packed, text = exported
+    packed, text, exact = exported
 
     def data(name):
         return re.search(rf'<script type="[^"]*" id="data-{name}">(.*?)</script>', text, re.DOTALL)[1]
 
-    assert json.loads(data("scene")) == packed.meta
-    assert gzip.decompress(base64.b64decode(data("geometry"))) == packed.geometry
-    assert gzip.decompress(base64.b64decode(data("harmonics"))) == packed.harmonics
+    meta = json.loads(data("scene"))
+    if exact:
+        assert gzip.decompress(base64.b64decode(data("geometry"))) == packed.geometry
+        assert gzip.decompress(base64.b64decode(data("harmonics"))) == packed.harmonics
+    else:
+        made, columns = compress(packed)
+        assert meta.pop("compressed") == json.loads(json.dumps(made))
+        assert base64.b64decode(data("columns")) == columns
+    assert meta == packed.meta
     assert data("sorter") == pages.page_file("sort.js")
 
 
 def test_the_exported_file_allows_its_own_script_and_style_only(exported):
-    _, text = exported
+    _, text, _ = exported
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)[1]
     assert text.index("Content-Security-Policy") < text.index("<style>")
     allowed = dict(part.split(maxsplit=1) for part in policy.split("; "))
@@ -357,7 +364,7 @@ def test_the_exported_file_allows_its_own_script_and_style_only(exported):
 
 
 def test_the_exported_file_refers_to_nothing_outside(exported):
-    _, text = exported
+    _, text, _ = exported
     assert not re.search(r'(src|href)="(?!data:)', text)
     assert "http://" not in text and "https://" not in text
     assert not re.search(r"^\s*(import|export)\s", text, re.MULTILINE)
@@ -385,6 +392,16 @@ def test_export_by_the_command(files, capsys):
     text = out.read_text(encoding="utf-8")
     assert '"footprint": "box:samples=4"' in text and '"name": "other"' in text
     assert "30 Gaussians" in capsys.readouterr().out
+
+
+def test_the_command_rounds_unless_exact(files):
+    arguments, out = ("--export", files / "out.html"), files / "out.html"
+    assert run_view(files / "scene.ply", *arguments) == 0
+    assert 'id="data-columns"' in out.read_text(encoding="utf-8")
+    assert run_view(files / "scene.ply", *arguments, "--exact") == 0
+    assert 'id="data-geometry"' in out.read_text(encoding="utf-8")
+    assert run_view(files / "scene.ply", *arguments, "--compact") == 0  # has a rounding of its own
+    assert 'id="data-geometry"' in out.read_text(encoding="utf-8")
 
 
 def test_the_command_takes_the_footprint_of_the_file(files):
@@ -448,6 +465,8 @@ def test_the_background_is_that_of_the_file(files):
         ("scene.ply --views missing.json", "missing.json"),
         ("scene.ply --export out.txt", "--export must end in .html"),
         ("scene.ply --export out.html --port 8000", "--port is for serving"),
+        ("scene.ply --exact", "--exact is for --export"),
+        ("scene.ply --server --exact", "leave out --server"),
         ("scene.ply --export out.html --device cpu", "--device and --threads are for --server"),
         ("scene.ply --export scene.ply/out.html", "scene.ply: expected a folder for the results, got a file"),
         ("broken.ply", "broken.ply"),
@@ -545,18 +564,6 @@ def test_shaders_have_no_numbers_of_their_own():
         if name.startswith("webgl_shaders") or (name.endswith(".wgsl.js") and name != "present.wgsl.js"):
             found = set(re.findall(r"(?<![\w.])\d+\.\d{3,}", pages.page_file(name)))
             assert found <= {"0.4366", "0.6240", "0.6975"}, (name, found)
-
-
-def run_node(folder, modules, script):
-    """What a script that imports these modules of the page prints, as JSON."""
-    if shutil.which("node") is None:
-        pytest.skip("needs node")
-    for name in modules:
-        (folder / name).write_text(pages.page_file(name))
-    (folder / "package.json").write_text('{"type": "module"}')
-    (folder / "script.js").write_text(script)
-    done = subprocess.run(["node", "script.js"], cwd=folder, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
 
 
 PARSE = """

@@ -36,6 +36,7 @@ from pages import (
     ROOT_MEAN_SQUARE_OF_HALVES,
     WEBGL_FOOTPRINTS,
     assert_same,
+    gaussians_of,
     random_scene,
     rendered,
     serve,
@@ -46,6 +47,7 @@ from places import SHARED
 import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import io, viewer
+from analytic_rasterizer.viewer.compressed import compress, decompress
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-browser")
 
@@ -171,10 +173,22 @@ def test_what_the_screen_shows_is_the_picture(browser):
 
 
 @pytest.mark.gate
-def test_an_exported_file_looks_the_same_without_network(browser, tmp_path):
+def test_a_compressed_file_is_near_without_network(browser, tmp_path):
     scene, view = random_scene(500), turned_view()
     path = tmp_path / "a scene.html"
-    viewer.export_page(path, viewer.pack_scene(scene, [view], footprint="mip"))
+    packed = viewer.pack_scene(scene, [view], footprint="mip")
+    viewer.export_page(path, packed)
+    rounded = gaussians_of(decompress(packed.meta, *compress(packed)))
+    with open_page(browser, f"{path.as_uri()}?view=0", offline=True) as page:
+        wait_until_ready(page)
+        assert_same(pixels(page, view.width, view.height), rendered(rounded, view, "mip"))
+
+
+@pytest.mark.gate
+def test_an_exact_file_looks_the_same_without_network(browser, tmp_path):
+    scene, view = random_scene(500), turned_view()
+    path = tmp_path / "a scene.html"
+    viewer.export_page(path, viewer.pack_scene(scene, [view], footprint="mip"), exact=True)
     with open_page(browser, f"{path.as_uri()}?view=0", offline=True) as page:
         wait_until_ready(page)
         exported = pixels(page, view.width, view.height)

@@ -1,5 +1,7 @@
 // Brings the scene into the page: from the server, or from the elements of an exported file.
 
+import { decompress } from './compressed.js';
+
 const embedded = name => document.getElementById(`data-${name}`);
 
 /// Whether page and scene are one file.
@@ -12,6 +14,7 @@ export async function loadMeta() {
 
 /// {meta, geometry, harmonics}; `progress` is called with the part that has been read, from 0 to 1.
 export async function loadScene(meta, progress) {
+  if (meta.compressed) return { meta, ...decompress(meta, await unpack('columns')) };
   if (isExported()) {
     const geometry = await unpack('geometry');
     progress(0.5);
