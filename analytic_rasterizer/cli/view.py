@@ -38,7 +38,7 @@ def add_parser(subcommands) -> None:
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
     )
     parser.add_argument(
-        "--exact", action="store_true", help="export all numbers as they are, in a file five times as large"
+        "--exact", action="store_true", help="export all numbers as they are, in a file several times as large"
     )
     parser.add_argument(
         "--compact", action="store_true", help="half of the memory: harmonics of 8 bits, for browsers with WebGPU only"

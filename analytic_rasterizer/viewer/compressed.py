@@ -20,6 +20,7 @@ Steps of means and rotations are powers of two that follow from rounded scales. 
 
 from __future__ import annotations
 
+import math
 import zlib
 from itertools import product
 from typing import Any
@@ -100,9 +101,10 @@ def decompress(meta: dict[str, Any], made: dict[str, Any], data: bytes) -> Packe
     differences, opacities = read.next(3), read.next(1)[:, 0] + 128
     mean_step, rotation_step, harmonics_step = _steps(made, steps, opacities)
     geometry = np.zeros((count, GEOMETRY_WIDTH))
-    mean = np.zeros(3)
-    for i, step in enumerate(mean_step):
-        geometry[i, :3] = mean = (_rounded(mean / step) + differences[i]) * step
+    for axis in range(3):
+        mean = 0.0
+        for i, (step, difference) in enumerate(zip(mean_step[:, 0].tolist(), differences[:, axis].tolist())):
+            geometry[i, axis] = mean = (math.floor(mean / step + 0.5) + difference) * step
     geometry[:, 3] = opacities / made["opaque"]
     geometry[:, 4:7] = 2.0 ** (steps / made["octave"])
     x, y, z = (read.next(3) * rotation_step).T

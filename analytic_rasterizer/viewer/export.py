@@ -24,8 +24,8 @@ def export_page(path, scene: PackedScene, *, exact: bool = False) -> int:
 
     Args:
         scene: What `pack_scene` returned.
-        exact: Keep all numbers as they are. Otherwise they are rounded (`compressed.py`), and the file has about a
-            fifth of the size. Compact scenes are always kept.
+        exact: Keep all numbers as they are. Otherwise they are rounded (`compressed.py`), and the file is
+            several times smaller. Compact scenes are always kept.
 
     Raises:
         ValueError: A scene too large for one file.

@@ -110,6 +110,13 @@ def test_pictures_of_random_gaussians():
     assert_near(random_scene(), [turned_view(), turned_view().scaled(0.25)], "analytic")
 
 
+def test_bytes_of_random_gaussians():
+    scene = random_scene(20_000)
+    scene.shs[:, 1:] *= 0.4  # as strong as those of the potted plant, in no order
+    _, data = compressed.compress(viewer.pack_scene(scene))
+    assert 4 / 3 * len(data) <= BYTES * len(scene.means)
+
+
 def test_bytes_and_pictures_of_a_trained_scene(tmp_path, plant):
     inputs, cameras = plant
     scene, views = of_inputs(inputs), []
