@@ -30,6 +30,7 @@ UNFILTERED = f"{DILATED}:dilation=0"  # samples without a filter, also for Gauss
 COMPENSATED = "mip"  # of Mip-Splatting, and of the modes that others call antialiased
 RECOMMENDED = "moment:samples=4"  # for training, and for scenes that were baked
 FASTEST = "box:samples=1"  # that integrates over the pixel
+INTEGRATING = (PAPER, "box", "moment")  # names of those for whose trainings FASTEST can begin
 FOUR_SAMPLES = "box:samples=4"
 SIXTEEN_SAMPLES = "box:samples=16"
 EXACT = "exact"  # the weight without an error

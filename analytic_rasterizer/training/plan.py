@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from .. import io
-from ..footprints import RECOMMENDED, resolve_footprint
+from ..footprints import FASTEST, INTEGRATING, RECOMMENDED, resolve_footprint
 from .captures import IMAGES, about_folds, lens_models
 from .evidence import (
     LARGEST,
@@ -49,9 +49,8 @@ SCALES = (1, 2, 4, 8)
 
 # While shapes are being found, one sample in a pixel does as well as many: until such a share of the training where
 # photographs show most points at one size, and where edges are finer than a pixel (docs/internals/training.md).
-CHEAP, CHEAP_UNTIL, CHEAP_UNTIL_FINE = "box:samples=1", 0.9, 0.5
+CHEAP_UNTIL, CHEAP_UNTIL_FINE = 0.9, 0.5
 MOST_VARIED = 50.0  # percent of points whose sampling intervals differ, up to which it does
-DEAR = ("analytic", "box", "moment")  # footprints that integrate over the same pixel
 
 
 @dataclass(frozen=True)
@@ -123,14 +122,14 @@ class CapturePlan:
 
     def beginning(self, footprint: str, scales: Sequence[int]) -> dict[str, Any]:
         """Options of `train` for a cheaper footprint at the beginning of a training for `footprint` at such scales."""
-        if resolve_footprint(footprint).name not in DEAR or footprint == CHEAP:
+        if resolve_footprint(footprint).name not in INTEGRATING or footprint == FASTEST:
             return {}
         found = {finding.effect: finding for finding in self.findings}
         share, alpha = found["sampling"].number, found["alpha"].verdict == YES
         if not alpha and (share is None or share > MOST_VARIED):
             return {}
         fine = alpha or len(scales) > 1  # edges finer than a pixel
-        return {"first_footprint": CHEAP, "footprint_from": CHEAP_UNTIL_FINE if fine else CHEAP_UNTIL}
+        return {"first_footprint": FASTEST, "footprint_from": CHEAP_UNTIL_FINE if fine else CHEAP_UNTIL}
 
     def to_lines(self) -> list[str]:
         """A line of what was looked at, then one for each finding: the first lines of `train`."""
