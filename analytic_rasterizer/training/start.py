@@ -17,7 +17,7 @@ from .captures import Capture
 from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
-from .parts import BACKGROUNDS, RANDOM_BACKGROUND, RANDOM_POINTS
+from .parts import BACKGROUNDS, RANDOM_BACKGROUND
 from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
 
@@ -71,16 +71,16 @@ def begin(
 ) -> tuple[Gaussians, int | None, TrainingOptions, list[str]]:
     """As `first_gaussians`; and the options, with a limit of Gaussians by what the pictures can show, and what to say.
 
-    The limit takes no Gaussian of the start away, but for random ones, whose number nobody chose.
+    The limit takes no Gaussian of the start away: fewer random ones learn worse.
     """
     limit = pixel_limit(options, [item.view for item in capture.train], chosen)
-    if limit is not None and options.random_points == RANDOM_POINTS and "random_points" not in chosen:
-        options = replace(options, random_points=min(RANDOM_POINTS, limit))
     start, found = first_gaussians(options, capture, points, chosen)
     said = []
     if limit is not None:
         options = replace(options, max_gaussians=max(limit, start.count))
-        shown = f"as many as {len(capture.train)} pictures of this size can show"
+        shown = (
+            f"one for {options.pixels_per_gaussian:g} pixels of {len(capture.train)} pictures, or those of the start"
+        )
         said.append(f"at most {options.max_gaussians:,} Gaussians, {shown} (--pixels-per-gaussian, --max-gaussians)")
     if points is None and capture.points is None and capture.starts_in_view:
         said.append(f"no points in the capture: starts from {start.count:,} random ones in the views (--points)")

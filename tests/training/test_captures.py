@@ -1000,7 +1000,7 @@ def test_what_was_chosen_is_said(tmp_path, capsys):
     said = notes_of(capsys.readouterr().err)
     assert re.search(EXACT % "perspective", "\n".join(said))
     assert said[-1] == "no points in the capture: starts from 50 random ones in the views (--points)"
-    assert said[-2].startswith("at most 1,000 Gaussians, as many as ") and len(said) == 3
+    assert said[-2].startswith("at most 1,000 Gaussians, one for 16 pixels of ") and len(said) == 3
     assert all(view.lens is not None for view in io.load_views(tmp_path / "kept" / "cameras.json"))
     assert commands.evaluate(tmp_path / "kept") == 0
     assert json.loads((tmp_path / "kept" / "evaluation.json").read_text())["resampled"] == 0
