@@ -8,7 +8,7 @@ install analytic_rasterizer[cli]`; they are imported on first use.
 from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene, is_dilated
 from .errors import SceneError, optional_import
 from .images import to_image
-from .metadata import SceneMetadata, read_metadata
+from .metadata import SceneMetadata, read_axes, read_metadata
 from .points import is_scene, load_points
 from .scenes import PLY_COLUMNS, load_scene, save_scene, written_format
 from .video import save_video
@@ -31,6 +31,7 @@ __all__ = [
     "load_scene",
     "load_views",
     "optional_import",
+    "read_axes",
     "read_metadata",
     "save_image",
     "save_scene",

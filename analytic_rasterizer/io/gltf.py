@@ -1,8 +1,8 @@
 """glTF with KHR_gaussian_splatting (Khronos): .glb, and .gltf with buffers inside or beside it.
 
 Gaussians are points of a mesh, their numbers attributes of it: scales and opacities as they are, quaternions (x, y, z,
-w). A glTF is y-up and scenes of 3DGS are y-down, so that both directions turn by half a turn about x, harmonics too.
-What the extension leaves open, we do not interpret: it names no filter of pixels.
+w). The axes are those of the file (see `axes`). What the extension leaves open, we do not interpret: it names no filter
+of pixels.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import torch
 
 from ..cameras.rotations import rotation_matrices
 from ..gaussians import SH_C0
+from .axes import with_axes
 from .errors import SceneError, naming, unreadable
 from .turning import quaternion_of, turned_harmonics, turned_quaternions
 
@@ -36,7 +37,7 @@ SIGNED, UNSIGNED, ANY = (5126, 5120, 5122), (5126, 5121, 5123), tuple(TYPES)
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 FEWEST_BYTES = 16  # of a Gaussian: what a file shows more often than that is refused, before memory is taken
 TOLERANCE = 1e-4  # relative, of a node's matrix from a rotation with one scale
-HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # from and to y-up
+AXES_BEFORE = "rub"  # of files of versions that did not write their axes
 
 
 def read_gltf(path: Path) -> dict[str, np.ndarray]:
@@ -51,11 +52,13 @@ def read_gltf(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines that `to_gltf` wrote. Raises SceneError, which names the file."""
+    """The lines that `to_gltf` wrote, with the axes of earlier versions. Raises SceneError, which names the file."""
     with naming(path), unreadable():
-        extras = _Reader(path).json["asset"].get("extras")
+        asset = _Reader(path).json["asset"]
+        extras = asset.get("extras")
         lines = extras.get(OWN) if isinstance(extras, dict) else None
-        return [line for line in lines if isinstance(line, str)] if isinstance(lines, list) else []
+        found = [line for line in lines if isinstance(line, str)] if isinstance(lines, list) else []
+        return with_axes(found, AXES_BEFORE) if asset.get("generator") == OWN else found
 
 
 class _Reader:
@@ -107,7 +110,7 @@ class _Reader:
         size = sum(map(len, self.buffers.values()))
         if rows > size / FEWEST_BYTES:
             raise SceneError(f"cut short: {rows} Gaussians are too many for {size} bytes")
-        parts = [_placed(self._gaussians(primitive), HALF_TURN @ matrix) for matrix, primitive in shown]
+        parts = [_placed(self._gaussians(primitive), matrix) for matrix, primitive in shown]
         bands = max(part["shs"].shape[1] for part in parts)
         for part in parts:
             part["shs"] = np.pad(part["shs"], ((0, 0), (0, bands - part["shs"].shape[1]), (0, 0)))
@@ -262,22 +265,20 @@ def to_gltf(fields: dict[str, np.ndarray], lines: Sequence[str], binary: bool) -
 
     Args:
         fields: As from `read_gltf`, finite but for scales of 0, at least one, with unit quaternions.
-        lines: Text for asset.extras.
+        lines: Text for asset.extras, with the line of its axes.
         binary: Whether it is a .glb.
     """
-    placed = _placed(fields, HALF_TURN)
-    placed["rotations"] *= -1  # the other sign of the same: with two half turns it is the quaternion as it was
-    opacities = 1 / (1 + np.exp(-placed["logit_opacities"].astype(np.float64)))
-    degree = int(np.sqrt(placed["shs"].shape[1])) - 1
+    opacities = 1 / (1 + np.exp(-fields["logit_opacities"].astype(np.float64)))
+    degree = int(np.sqrt(fields["shs"].shape[1])) - 1
     columns = {
-        "POSITION": placed["means"],
-        f"{NAME}:ROTATION": placed["rotations"][:, [1, 2, 3, 0]],
-        f"{NAME}:SCALE": np.exp(placed["log_scales"].astype(np.float64)),
+        "POSITION": fields["means"],
+        f"{NAME}:ROTATION": fields["rotations"][:, [1, 2, 3, 0]],
+        f"{NAME}:SCALE": np.exp(fields["log_scales"].astype(np.float64)),
         f"{NAME}:OPACITY": opacities,
     }
-    columns |= {name: placed["shs"][:, i] for i, name in enumerate(_harmonics(degree))}
+    columns |= {name: fields["shs"][:, i] for i, name in enumerate(_harmonics(degree))}
     columns = {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
-    columns["COLOR_0"] = _fallback(placed["shs"][:, 0], opacities)
+    columns["COLOR_0"] = _fallback(fields["shs"][:, 0], opacities)
     views, accessors, start = [], [], 0
     for name, column in columns.items():
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]

@@ -10,10 +10,12 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ..footprints import COMPENSATED, DILATED, resolve_footprint
 from . import gltf, ply, sog, spz
+from .axes import axes_in, axes_of_format, checked_axes
 from .errors import first_line
 from .formats import scene_file
 
@@ -30,7 +32,7 @@ class SceneMetadata:
             this package say it.
         antialiased: Whether the scene wants pixels that are integrated. Other programs say so too, after a training
             with an antialiasing filter. In an .spz, False is also what programs write that know nothing about it.
-        offset: (x, y, z), world units. Positions in the world are those of the file plus this.
+        offset: (x, y, z), world units. Positions in the world are those that `load_scene` returns plus this.
         comments: Other lines of text.
         background: (r, g, b) in [0, 1], the colour that the scene is to be seen in front of.
     """
@@ -101,9 +103,12 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
             fields["antialiased"] = words[1] == "mip"
         elif words in (["antialiased", "0"], ["antialiased", "1"]):  # Postshot
             fields["antialiased"] = words[1] == "1"
-        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"], ["background"]):
+        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"], ["background"], ["axes"]):
             _, name, *values = words
             try:
+                if name == "axes":  # of the file, and not of the scene
+                    checked_axes(" ".join(values))
+                    continue
                 value = " ".join(values) if name == "footprint" else tuple(map(float, values))
                 fields[name] = getattr(SceneMetadata(**{name: value}).checked(), name)
             except (ValueError, TypeError) as error:
@@ -125,13 +130,33 @@ def read_metadata(path) -> SceneMetadata:
             `load_scene` reads.
     """
     path, kind = scene_file(path)
+    antialiased, lines = _read_lines(path, kind)
+    found = metadata_of(lines, path)
+    return found if antialiased is None else replace(found, antialiased=antialiased)
+
+
+def read_axes(path) -> str:
+    """The axes of the numbers in the file `path` of a scene, such as "rub": what it says, or those of its format.
+
+    `load_scene` turns them to RDF. Of a .ply, .splat or .sog that says nothing they are RDF, of an .spz RUB, and of a
+    glTF LUF. Before axes were written, this package wrote RDF into an .spz and RUB into a glTF. Such files are known by
+    our lines in them, but for an .spz without metadata.
+
+    Raises:
+        SceneError: As `read_metadata`.
+    """
+    path, kind = scene_file(path)
+    return axes_in(_read_lines(path, kind)[1]) or axes_of_format(kind)
+
+
+def _read_lines(path: Path, kind: str) -> tuple[bool | None, Sequence[str]]:
+    """What a file says of antialiasing by its own means, and its lines of text."""
     if kind == "spz":
-        antialiased, lines = spz.read_metadata(path)
-        return replace(metadata_of(lines, path), antialiased=antialiased)
+        return spz.read_metadata(path)
     if kind == "sog":
-        return SceneMetadata(antialiased=sog.is_antialiased(path))
+        return sog.is_antialiased(path), []
     if kind == "gltf":
-        return metadata_of(gltf.read_lines(path), path)
+        return None, gltf.read_lines(path)
     if kind == "splat":
-        return SceneMetadata()
-    return metadata_of(ply.read_header(path).comments, path)
+        return None, []
+    return None, ply.read_header(path).comments

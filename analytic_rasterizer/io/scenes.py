@@ -11,16 +11,18 @@ import torch
 
 from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
 from . import gltf, ply, sog, splat, spz
+from .axes import axes_of_format, checked_axes, flipped, with_axes
 from .compressed import is_compressed, read_compressed, to_compressed
 from .errors import SceneError, first_line, naming
 from .formats import scene_file
-from .metadata import SceneMetadata
-from .points import AXES, has_colors, read_colors
+from .metadata import SceneMetadata, read_axes
+from .points import AXES as POSITION
+from .points import has_colors, read_colors
 from .writing import write_safely
 
 BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
-PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
+PLY_COLUMNS = [*POSITION, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
 """Properties that a vertex of a 3DGS .ply must have; harmonics beyond the constant follow as f_rest_0, f_rest_1, ..."""
 HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
 WRITTEN = {
@@ -35,7 +37,7 @@ FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, 
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
 
-def load_scene(path, strict: bool = False) -> Gaussians:
+def load_scene(path, strict: bool = False, axes: str | None = None) -> Gaussians:
     """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic), a .splat
     or a glTF (.glb, .gltf).
 
@@ -43,13 +45,13 @@ def load_scene(path, strict: bool = False) -> Gaussians:
     are read where there are no harmonics, as those of degree 0.
 
     Gaussians that have a number that is not finite are left out, and a warning counts them. Another warning says where
-    positions of double precision lose what matters in float32. Axes are those stored in the file: tools that make .spz
-    may have turned the scene (y and z negated), and nothing in the file says so. A glTF is y-up, and is
-    turned to y-down.
+    positions of double precision lose what matters in float32. The axes of the result are
+    RDF: x right, y down, z forward (see `read_axes`).
 
     Args:
         path: The file. Its suffix, in any case, says which format it has.
         strict: Refuse a file with numbers that are not finite.
+        axes: Those of the file, such as "rub", if it says nothing or not the truth; None: `read_axes` of it.
 
     Returns:
         float32, on the CPU. Scales of 0, and in a .ply opacities of 0 and 1, have infinite parameters.
@@ -57,9 +59,11 @@ def load_scene(path, strict: bool = False) -> Gaussians:
     Raises:
         SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
             the file.
+        ValueError: Unknown axes.
         ImportError: The extra `cli` is missing, which formats other than .ply, .splat and glTF need.
     """
     path, kind = scene_file(path)
+    axes = None if axes is None else checked_axes(axes)
     readers = {
         "ply": _read_ply,
         "spz": spz.read_spz,
@@ -68,7 +72,7 @@ def load_scene(path, strict: bool = False) -> Gaussians:
         "gltf": gltf.read_gltf,
     }
     try:
-        fields = readers[kind](path)
+        fields = flipped(readers[kind](path), axes or read_axes(path))
     except OSError as error:
         raise SceneError(f"{path}: unreadable ({error.strerror or first_line(error)})") from None
     scene = Gaussians(**{name: _tensor(field) for name, field in fields.items()})
@@ -139,7 +143,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         rest = rows.columns([f"f_rest_{i}" for i in range(count)], np.float32)
         shs[:, 1:] = rest.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
         fields = {
-            "means": rows.columns(AXES),
+            "means": rows.columns(POSITION),
             "log_scales": rows.columns(SCALES, np.float32),
             "rotations": rows.columns(ROTATIONS, np.float32),
             "logit_opacities": rows.columns(["opacity"], np.float32),
@@ -180,7 +184,7 @@ def written_format(path) -> str:
     return WRITTEN[path.suffix.lower()]
 
 
-def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) -> None:
+def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, axes: str | None = None) -> None:
     """Writes a scene as .ply, .compressed.ply, .spz (version 3), .splat, .glb or .gltf, by its name.
 
     A .ply holds the parameters as they are, but for infinite logits: opacities are then kept off 0 and 1 by 1e-6. The
@@ -191,11 +195,13 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
         path: The file, which is replaced once the new one is complete.
         scene: float32 or float64, on any device.
         metadata: What the file says beside the Gaussians, such as `SceneMetadata(footprint="moment")`.
+        axes: Those of the file, such as "rub" with y up; None: those of other programs (see `read_axes`). `load_scene`
+            turns the scene back, unless the file is a .splat, which does not say its axes.
 
     Raises:
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
-            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata that cannot be written; in
-            all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
+            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata or axes that cannot be
+            written; in all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
     """
@@ -204,6 +210,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
         raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:
         metadata = (metadata or SceneMetadata()).checked()
+        axes = axes_of_format(kind) if axes is None else checked_axes(axes)
     except (ValueError, TypeError) as error:
         raise SceneError(f"{path}: {first_line(error)}") from None
     scene = scene.map(lambda field: field.detach().to("cpu", torch.float32))
@@ -213,28 +220,35 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
     logits = scene.logit_opacities
     kept = logits.clamp(-HIGHEST_LOGIT, HIGHEST_LOGIT)
     fields = scene._replace(logit_opacities=torch.where(logits.isinf(), kept, logits))
-    fields = {name: field.numpy() for name, field in fields._asdict().items()}
+    fields = flipped({name: field.numpy() for name, field in fields._asdict().items()}, axes)
+    lines = _lines(kind, metadata, axes)
     if kind == "ply":
-        columns, comments = _columns(fields), metadata.lines()
+        columns, comments = _columns(fields), lines
         write_safely(path, lambda temporary: ply.write(temporary, "vertex", columns, comments))
         return
     fields["rotations"] = _unit(fields["rotations"])
     if kind == "compressed":
-        content = to_compressed(fields, metadata.lines())
+        content = to_compressed(fields, lines)
         write_safely(path, lambda temporary: temporary.write_bytes(content))
     elif kind in ("glb", "gltf"):
         with naming(path):
-            content = gltf.to_gltf(fields, metadata.lines(), kind == "glb")
+            content = gltf.to_gltf(fields, lines, kind == "glb")
         write_safely(path, lambda temporary: temporary.write_bytes(content))
     elif kind == "spz":
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
-        lines = replace(metadata, antialiased=None).lines()
         write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
     else:
         content = splat.to_splat(fields)
-        _warn_of_loss(path, scene, metadata)
+        _warn_of_loss(path, scene, metadata, axes)
         write_safely(path, lambda temporary: temporary.write_bytes(content))
+
+
+def _lines(kind: str, metadata: SceneMetadata, axes: str) -> list[str]:
+    """The text of a file, with its axes where they are in doubt: in a format that this package wrote with others."""
+    lines = (replace(metadata, antialiased=None) if kind == "spz" else metadata).lines()  # which has a flag
+    in_doubt = kind in ("glb", "gltf") or (kind == "spz" and lines)
+    return with_axes(lines, axes) if in_doubt or axes != axes_of_format(kind) else lines
 
 
 def _check(scene: Gaussians, kind: str) -> None:
@@ -260,7 +274,7 @@ def _columns(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     shs = fields["shs"]
     # All bands of red come first, then those of green, then those of blue.
     rest = [shs[:, band, color] for color in range(3) for band in range(1, shs.shape[1])]
-    columns = dict(zip(AXES, fields["means"].T)) | dict(zip(BASE_COLOR, shs[:, 0].T))
+    columns = dict(zip(POSITION, fields["means"].T)) | dict(zip(BASE_COLOR, shs[:, 0].T))
     columns |= {f"f_rest_{i}": column for i, column in enumerate(rest)}
     columns["opacity"] = fields["logit_opacities"][:, 0]
     return columns | dict(zip(SCALES, fields["log_scales"].T)) | dict(zip(ROTATIONS, fields["rotations"].T))
@@ -274,9 +288,11 @@ def _unit(rotations: np.ndarray) -> np.ndarray:
     return np.where(length > 0, wide / np.where(length > 0, length, 1), identity).astype(np.float32)
 
 
-def _warn_of_loss(path: Path, scene: Gaussians, metadata: SceneMetadata) -> None:
+def _warn_of_loss(path: Path, scene: Gaussians, metadata: SceneMetadata, axes: str) -> None:
     """Says what a .splat cannot hold."""
     lost = metadata.lost()
+    if axes != axes_of_format("splat"):
+        lost.append(f"its axes ({axes})")
     if scene.shs[:, 1:].any():
         lost.append(f"harmonics beyond degree 0 (the scene has degree {scene.sh_degree})")
     if lost:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .axes import MEMORY, with_axes
 from .errors import SceneError, naming, optional_import, unreadable
 from .with_gsply import data_of, fields_of, gsply
 
@@ -116,10 +117,10 @@ def read_metadata(path: Path) -> tuple[bool, list[str]]:
 
 
 def _own_lines(records: bytes) -> list[str]:
-    """The text of our extension, if it is one of these records."""
+    """The text of our extension, if it is one of these records; files of earlier versions have the axes of memory."""
     while len(records) >= 8:
         kind, length = struct.unpack_from("<II", records)
         if kind == OWN_EXTENSION:
-            return records[8 : 8 + length].decode("utf-8", "replace").splitlines()
+            return with_axes(records[8 : 8 + length].decode("utf-8", "replace").splitlines(), MEMORY)
         records = records[8 + length :]
     return []

@@ -259,7 +259,9 @@ def test_an_spz_by_hand(tmp_path, version, degree, flags, records):
     scene = random_gaussians(degree=degree)
     (tmp_path / "a.Spz").write_bytes(spz_file(scene, version, flags, records))
     # Version 2 has 8 bits for x, y and z of a quaternion; w, which follows from them, may be small.
-    close(io.load_scene(tmp_path / "a.Spz"), scene, turned=1e-2 if version == 2 else 1e-4)
+    # A file with lines of ours that names no axes is one of an earlier version, which wrote those of memory.
+    found = io.load_scene(tmp_path / "a.Spz", axes="rdf" if not records else None)
+    close(found, scene, turned=1e-2 if version == 2 else 1e-4)
     metadata = io.read_metadata(tmp_path / "a.Spz")
     assert metadata.antialiased is bool(flags & 1)
     assert metadata.footprint == ("moment:samples=16" if records else None)
