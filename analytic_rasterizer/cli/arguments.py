@@ -40,6 +40,8 @@ METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser whose errors are one line, and which takes the numbers of a colour as three arguments, too.
 
+    A list of numbers may begin with a negative one, which ArgumentParser takes for an option.
+
     It takes no option by a part of its name: programs that call a command would break with the next option that begins
     so. The error for an unknown name says which is near.
 
@@ -55,7 +57,7 @@ class Parser(argparse.ArgumentParser):
 
         Options that do not exist are an error.
         """
-        args = _with_joined_colors(sys.argv[1:] if args is None else args)
+        args = _with_joined_lists(_with_joined_colors(sys.argv[1:] if args is None else args))
         unknown = self._unknown_options(args)
         if unknown:  # before what argparse says of an option that is required, and here has another name
             near = dict.fromkeys(name for option in unknown for name in self._near_options(option))
@@ -113,6 +115,16 @@ def _with_joined_colors(args: list[str]) -> list[str]:
         numbers = joined[i + 1 : i + 4]
         if len(numbers) == 3 and all(_is_number(text) for text in numbers):
             joined[i : i + 4] = [f"--background={','.join(numbers)}"]
+    return joined
+
+
+def _with_joined_lists(args: list[str]) -> list[str]:
+    """--crop -1,0,1 as --crop=-1,0,1."""
+    joined = list(args)
+    for i in reversed(range(1, len(joined))):
+        is_list = re.match(r"-[\d.]", joined[i]) is not None and "," in joined[i]
+        if is_list and re.fullmatch(r"--[a-z-]+", joined[i - 1]):
+            joined[i - 1 : i + 1] = [f"{joined[i - 1]}={joined[i]}"]
     return joined
 
 
@@ -176,11 +188,16 @@ def add_scene(parser) -> None:
     add_machine_options(parser)
 
 
-def add_files(parser, purpose: str = "file of views") -> None:
-    """SCENE and --views."""
+def add_scene_file(parser) -> None:
+    """SCENE."""
     formats = ".ply, compressed .ply, .spz, .sog, .splat, .glb, .gltf"
     scene = f"file of a scene ({formats}), or a folder: of `train`, or a model of 3DGS"
     parser.add_argument("scene", metavar="SCENE", help=scene)
+
+
+def add_files(parser, purpose: str = "file of views") -> None:
+    """SCENE and --views."""
+    add_scene_file(parser)
     views = f"{purpose}: {VIEWS} (default: cameras.json beside SCENE, or of the model of 3DGS)"
     parser.add_argument("--views", metavar="FILE", help=views)
 
@@ -338,6 +355,15 @@ def color(text: str) -> tuple[float, float, float]:
     return tuple(map(float, parts))
 
 
+def box(text: str) -> tuple[float, ...]:
+    """An argparse type: x0,y0,z0,x1,y1,z1 with x0 <= x1 and so on; inf and -inf leave a side open."""
+    parts = text.split(",")
+    numbers = tuple(map(float, parts)) if all(map(_is_float, parts)) else ()
+    if len(numbers) != 6 or not all(low <= high for low, high in zip(numbers[:3], numbers[3:])):
+        raise argparse.ArgumentTypeError(f"must be x0,y0,z0,x1,y1,z1, the lower corner first, got {text}")
+    return numbers
+
+
 def _is_reduction(value: float) -> bool:
     return math.isfinite(value) and value > 0
 
@@ -348,6 +374,7 @@ reductions = _numbers(float, _is_reduction, "reductions, positive numbers (2 is 
 reduction = _number(float, _is_reduction, "a reduction, a positive number (2 is half the size)")
 positive_number = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
 dilation = _number(float, lambda v: PIXEL_VARIANCE <= v < math.inf, "a number from 1/12")
+fraction = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
 tolerance = _number(float, lambda v: math.isfinite(v) and v >= 0, "a number that is not negative")
 density = _number(int, lambda v: v >= 8, "a whole number from 8")
 count = _number(int, lambda v: v >= 1, "a positive whole number")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
+
 import torch
 
 from .. import io
 from ..filters import bake_dilation, sampling_interval
 from ..footprints import DILATED, RECOMMENDED
+from ..io.scenes import WRITTEN_IN_WORDS
 from .arguments import (
     add_files,
     add_footprint,
@@ -36,8 +39,7 @@ def add_parser(subcommands) -> None:
     reduced = "the training's pictures had 1/N of the size in VIEWS (default: what cfg_args or options.json says, or 1)"
     add_scales(parser, reduction, reduced)
     add = parser.add_argument
-    written = ".ply, .compressed.ply, .spz, .splat, .glb or .gltf"
-    add("--out", required=True, metavar="FILE", help=f"the scene to write: {written}")
+    add("--out", required=True, metavar="FILE", help=f"the scene to write: {WRITTEN_IN_WORDS}")
     add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
     of_training = "of the training, px^2 (default: that of the footprint, 0.3)"
     add("--dilation", type=dilation, metavar="V", help=of_training)
@@ -51,7 +53,7 @@ def run(args) -> None:
     use_machine(args)
     found = io.find_scene(args.scene)
     trained = found.training_footprint(args.footprint)
-    check_is_dilated(found, trained)
+    check_is_dilated(found, trained, args.out)
     given = args.scales is not None
     views = found.load_views(args.views, args.size, trained_size=not given)
     views = [view.scaled(1 / args.scales) for view in views] if given else views
@@ -74,13 +76,16 @@ def run(args) -> None:
     print(f"{args.out}: {int(seen.sum())} of {scene.count} Gaussians, which are seen in {pictures}, are baked")
 
 
-def check_is_dilated(found: io.FoundScene, trained: io.Choice) -> None:
-    """Raises SceneError for a scene whose training added no dilation."""
+def check_is_dilated(found: io.FoundScene, trained: io.Choice, out: str) -> None:
+    """Raises SceneError for a scene whose training added no dilation; it says how to write `out` all the same."""
     footprint = trained.footprint
+    instead = f"to write it as it is: convert {shlex.quote(str(found.path))} {shlex.quote(out)}"
     if footprint.name != DILATED:
         raise io.SceneError(
             f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}: "
-            f"{trained.reason}); --footprint point is for a scene that was trained with 3DGS all the same"
+            f"{trained.reason}); {instead}; --footprint point is for a scene that was trained with 3DGS all the same"
         )
     if not io.is_dilated(footprint):
-        raise io.SceneError(f"{found.path}: no dilation to bake: it was trained with {footprint}, without any")
+        raise io.SceneError(
+            f"{found.path}: no dilation to bake: it was trained with {footprint}, without any; {instead}"
+        )

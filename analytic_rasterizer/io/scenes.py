@@ -33,6 +33,7 @@ WRITTEN = {
     ".glb": "glb",
     ".gltf": "gltf",
 }
+WRITTEN_IN_WORDS = ".ply, .compressed.ply, .spz, .splat, .glb or .gltf"
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
@@ -178,9 +179,7 @@ def written_format(path) -> str:
     if path.name.lower().endswith(".compressed.ply"):
         return "compressed"
     if path.suffix.lower() not in WRITTEN:
-        raise SceneError(
-            f"{path}: expected a .ply, .spz, .splat, .glb or .gltf name, got {path.suffix or 'no suffix'!r}"
-        )
+        raise SceneError(f"{path}: expected a {WRITTEN_IN_WORDS} name, got {path.suffix or 'no suffix'!r}")
     return WRITTEN[path.suffix.lower()]
 
 

@@ -452,8 +452,8 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        ("--out {}/baked.obj", "baked.obj: expected a .ply, .spz, .splat, .glb or .gltf name, got '.obj'"),
-        ("--out {}/baked.sog", "baked.sog: expected a .ply, .spz, .splat, .glb or .gltf name, got '.sog'"),
+        ("--out {}/baked.obj", "baked.obj: expected a .ply, .compressed.ply, .spz, .splat, .glb or .gltf name, got '.obj'"),
+        ("--out {}/baked.sog", "baked.sog: expected a .ply, .compressed.ply, .spz, .splat, .glb or .gltf name, got '.sog'"),
         ("--out {}/scene.ply/baked.ply", "scene.ply: expected a folder for the results, got a file"),
         ("--dilation 0.05", "argument --dilation: must be a number from 1/12, got 0.05"),
         ("--dilation x", "argument --dilation: must be a number from 1/12, got x"),
