@@ -6,16 +6,18 @@ from pathlib import Path
 
 from .errors import SceneError, check_content
 
+SOG_META = "meta.json"
 FORMATS = {
     ".ply": "ply",
     ".ply_compressed": "ply",
     ".spz": "spz",
     ".sog": "sog",
+    SOG_META: "sog",
     ".splat": "splat",
     ".glb": "gltf",
     ".gltf": "gltf",
 }
-"""Formats of scenes, by suffix."""
+"""Formats of scenes, by `suffix_of`."""
 
 
 def scene_file(path) -> tuple[Path, str]:
@@ -28,10 +30,14 @@ def scene_file(path) -> tuple[Path, str]:
         raise SceneError(f"{path}: expected a file of a scene, got a folder")
     if not path.is_file():
         raise SceneError(f"{path}: no such file")
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
     if suffix not in FORMATS:
-        raise SceneError(
-            f"{path}: expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got {path.suffix or 'no suffix'!r}"
-        )
+        expected = "a .ply, .spz, .sog, .splat, .glb, .gltf file or a meta.json"
+        raise SceneError(f"{path}: expected {expected}, got {path.suffix or 'no suffix'!r}")
     check_content(path)
     return path, FORMATS[suffix]
+
+
+def suffix_of(path: Path) -> str:
+    """The suffix in lower case; that of an unbundled .sog is the whole name of its meta.json."""
+    return SOG_META if path.name.lower() == SOG_META else path.suffix.lower()

@@ -1,7 +1,7 @@
 """Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
 
-A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json, a glTF in its
-asset.extras. A .splat holds none.
+A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json (extras), a glTF in
+its asset.extras. A .splat holds none.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _read_lines(path: Path, kind: str) -> tuple[bool | None, Sequence[str]]:
     if kind == "spz":
         return spz.read_metadata(path)
     if kind == "sog":
-        return sog.is_antialiased(path), []
+        return sog.read_metadata(path)
     if kind == "gltf":
         return None, gltf.read_lines(path)
     if kind == "splat":

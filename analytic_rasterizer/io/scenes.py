@@ -14,10 +14,11 @@ from . import gltf, ply, sog, splat, spz
 from .axes import axes_of_format, checked_axes, flipped, with_axes
 from .compressed import is_compressed, read_compressed, to_compressed
 from .errors import SceneError, first_line, naming
-from .formats import scene_file
+from .formats import SOG_META, scene_file, suffix_of
 from .metadata import SceneMetadata, read_axes
 from .points import AXES as POSITION
 from .points import has_colors, read_colors
+from .sog_writer import write_sog
 from .writing import write_safely
 
 BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -29,11 +30,13 @@ WRITTEN = {
     ".ply": "ply",
     ".ply_compressed": "compressed",
     ".spz": "spz",
+    ".sog": "sog",
+    SOG_META: "sog",
     ".splat": "splat",
     ".glb": "glb",
     ".gltf": "gltf",
 }
-WRITTEN_IN_WORDS = ".ply, .compressed.ply, .spz, .splat, .glb or .gltf"
+WRITTEN_IN_WORDS = ".ply, .compressed.ply, .spz, .sog, .splat, .glb, .gltf or meta.json"
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
@@ -170,7 +173,8 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
 
 
 def written_format(path) -> str:
-    """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz", "splat", "glb" or "gltf".
+    """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz", "sog", "splat", "glb",
+    or "gltf".
 
     Raises:
         SceneError: It writes none under this name.
@@ -178,17 +182,18 @@ def written_format(path) -> str:
     path = Path(path)
     if path.name.lower().endswith(".compressed.ply"):
         return "compressed"
-    if path.suffix.lower() not in WRITTEN:
+    if suffix_of(path) not in WRITTEN:
         raise SceneError(f"{path}: expected a {WRITTEN_IN_WORDS} name, got {path.suffix or 'no suffix'!r}")
-    return WRITTEN[path.suffix.lower()]
+    return WRITTEN[suffix_of(path)]
 
 
 def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, axes: str | None = None) -> None:
-    """Writes a scene as .ply, .compressed.ply, .spz (version 3), .splat, .glb or .gltf, by its name.
+    """Writes a scene as .ply, .compressed.ply, .spz (version 3), .sog (version 2), .splat, .glb or .gltf, by its name.
 
     A .ply holds the parameters as they are, but for infinite logits: opacities are then kept off 0 and 1 by 1e-6. The
-    other formats round (docs/library.md says how), and hold unit quaternions. A .splat has no place for metadata and
-    for harmonics beyond degree 0: where they matter a warning says what is lost.
+    other formats round (docs/library.md says how), and hold unit quaternions. A .sog changes the order of the
+    Gaussians; meta.json is an unbundled one, with pictures beside it. A .splat has no place for metadata and for
+    harmonics beyond degree 0: where they matter a warning says what is lost.
 
     Args:
         path: The file, which is replaced once the new one is complete.
@@ -199,10 +204,10 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
 
     Raises:
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
-            harmonics of degree 4 in an .spz or glTF; no Gaussians in a glTF; metadata or axes that cannot be
-            written; in all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
+            harmonics of degree 4 in an .spz, .sog or glTF; no Gaussians in a .sog or glTF; metadata or axes that
+            cannot be written; in all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
         OSError: The file cannot be written; an earlier one is then unchanged.
-        ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
+        ImportError: The extra `cli` is missing, which .compressed.ply, .spz and .sog need.
     """
     path, kind = Path(path), written_format(path)
     if not isinstance(metadata, (SceneMetadata, type(None))):
@@ -237,6 +242,8 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
         write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
+    elif kind == "sog":
+        write_sog(path, fields, metadata.antialiased, lines)
     else:
         content = splat.to_splat(fields)
         _warn_of_loss(path, scene, metadata, axes)
@@ -245,7 +252,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
 
 def _lines(kind: str, metadata: SceneMetadata, axes: str) -> list[str]:
     """The text of a file, with its axes where they are in doubt: in a format that this package wrote with others."""
-    lines = (replace(metadata, antialiased=None) if kind == "spz" else metadata).lines()  # which has a flag
+    lines = (replace(metadata, antialiased=None) if kind in ("spz", "sog") else metadata).lines()  # which have a flag
     in_doubt = kind in ("glb", "gltf") or (kind == "spz" and lines)
     return with_axes(lines, axes) if in_doubt or axes != axes_of_format(kind) else lines
 
@@ -258,10 +265,11 @@ def _check(scene: Gaussians, kind: str) -> None:
         field = getattr(scene, name)
         if field.shape != (count, *row):
             raise SceneError(f"{name} must have shape {(count, *row)}, got {tuple(field.shape)}")
-    if scene.sh_degree > 4 or (kind in ("spz", "glb", "gltf") and scene.sh_degree > 3):
+    if scene.sh_degree > 4 or (kind in ("spz", "sog", "glb", "gltf") and scene.sh_degree > 3):
         raise SceneError(f"harmonics of degree {scene.sh_degree} have no place in this format; a .ply holds degree 4")
-    if kind in ("glb", "gltf") and not count:
-        raise SceneError("a glTF has no place for a scene without Gaussians; a .ply has")
+    if kind in ("sog", "glb", "gltf") and not count:
+        name = ".sog" if kind == "sog" else "glTF"
+        raise SceneError(f"a {name} has no place for a scene without Gaussians; a .ply has")
     for name, field in numbers_of(scene).items() if kind != "ply" else ():
         good = field.flatten(1).isfinite().all(1)
         if not good.all():

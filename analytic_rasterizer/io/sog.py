@@ -1,4 +1,4 @@
-"""The .sog format (PlayCanvas): a ZIP archive of lossless pictures, and of a meta.json about them.
+"""The .sog format (PlayCanvas): a ZIP archive, or a folder, of lossless pictures and of a meta.json about them.
 
 Pixel i of a picture belongs to Gaussian i. Its bytes choose numbers from a codebook, or in files of the first version
 lie between two limits. Harmonics beyond degree 0 are rows of a palette. The format is described at
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,45 +19,69 @@ import numpy as np
 
 from .errors import SceneError, naming, optional_import, unreadable
 
+META = "meta.json"
+OWN = "analytic_rasterizer"  # the key of its extras that holds lines, those of a .ply's comments
 FIRST_MODE = 252  # of a quaternion's fourth byte, which names the largest component
 PER_ROW = 64  # entries of the palette in a row of its picture
 LARGEST_DEGREE = 3
 
 
 def read_sog(path: Path) -> dict[str, np.ndarray]:
-    """The parameters of a .sog of version 1 or 2, by the names of the fields of `Gaussians`.
+    """The parameters of a .sog or meta.json of version 1 or 2, by the names of the fields of `Gaussians`.
 
     Opacities are kept off 0 and 1 by 1e-6, where their logit is infinite.
 
     Raises SceneError, which names the file, for a broken one; ImportError without Pillow.
     """
     optional_import("PIL.Image")
-    with naming(path), unreadable(), zipfile.ZipFile(path) as archive:
-        return _Reader(archive).fields()
+    with naming(path), unreadable(), _opened(path) as read:
+        return _Reader(read).fields()
 
 
-def is_antialiased(path: Path) -> bool | None:
-    """Whether the file says that pixels are to be integrated; None where it says nothing. Raises SceneError."""
-    with naming(path), unreadable(), zipfile.ZipFile(path) as archive:
-        meta = _meta(archive)
+def read_metadata(path: Path) -> tuple[bool | None, list[str]]:
+    """Whether the file says that pixels are to be integrated, None where it says nothing, and our lines in it.
+
+    Raises SceneError, which names the file.
+    """
+    with naming(path), unreadable(), _opened(path) as read:
+        meta = _meta(read)
+    extras = meta.get("extras")
+    lines = extras.get(OWN) if isinstance(extras, dict) else None
+    lines = [line for line in lines if isinstance(line, str)] if isinstance(lines, list) else []
     if "model" in meta:
-        return meta["model"] == "antialiased"
+        return meta["model"] == "antialiased", lines
     found = meta.get("antialias")  # of earlier files
-    return found if isinstance(found, bool) else None
+    return found if isinstance(found, bool) else None, lines
 
 
-def _meta(archive: zipfile.ZipFile) -> dict[str, Any]:
-    meta = json.loads(archive.read("meta.json"))
+@contextmanager
+def _opened(path: Path) -> Iterator[Callable[[str], bytes]]:
+    """What reads a member by its name, from an archive or from the folder of a meta.json."""
+    if path.suffix.lower() != ".json":
+        with zipfile.ZipFile(path) as archive:
+            yield archive.read
+        return
+
+    def read(name: str) -> bytes:
+        if Path(name).name != name:
+            raise SceneError(f"expected the name of a file beside it, got {name!r}")
+        return (path if name == META else path.with_name(name)).read_bytes()
+
+    yield read
+
+
+def _meta(read: Callable[[str], bytes]) -> dict[str, Any]:
+    meta = json.loads(read(META))
     if not isinstance(meta, dict):
         raise SceneError(f"meta.json must hold an object, got {type(meta).__name__}")
     return meta
 
 
 class _Reader:
-    """An open archive. Whatever it lacks raises KeyError, IndexError or another error of Python."""
+    """An open file. Whatever it lacks raises KeyError, IndexError or another error of Python."""
 
-    def __init__(self, archive: zipfile.ZipFile):
-        self.archive, self.meta = archive, _meta(archive)
+    def __init__(self, read: Callable[[str], bytes]):
+        self.read, self.meta = read, _meta(read)
         version = self.meta.get("version", 1)
         if version not in (1, 2):
             raise SceneError(f"expected version 1 or 2, got {version}")
@@ -82,7 +108,7 @@ class _Reader:
 
     def picture(self, name: str, number: int = 0) -> np.ndarray:
         """A picture of a property, (height, width, 4) bytes."""
-        content = self.archive.read(self.meta[name]["files"][number])
+        content = self.read(self.meta[name]["files"][number])
         with optional_import("PIL.Image").open(BytesIO(content)) as opened:
             return np.asarray(opened.convert("RGBA"))
 

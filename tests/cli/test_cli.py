@@ -25,6 +25,7 @@ from processes import DEADLINE, python_path, run_program
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.cli import arguments as arguments_of_commands
+from analytic_rasterizer.io.scenes import WRITTEN_IN_WORDS
 
 FOOTPRINT_ARGUMENTS = {
     "default": ([], {"footprint": "point"}),  # what a file wants that says nothing
@@ -452,8 +453,8 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        ("--out {}/baked.obj", "baked.obj: expected a .ply, .compressed.ply, .spz, .splat, .glb or .gltf name, got '.obj'"),
-        ("--out {}/baked.sog", "baked.sog: expected a .ply, .compressed.ply, .spz, .splat, .glb or .gltf name, got '.sog'"),
+        ("--out {}/baked.obj", f"baked.obj: expected a {WRITTEN_IN_WORDS} name, got '.obj'"),
+        ("--out {}/baked.json", f"baked.json: expected a {WRITTEN_IN_WORDS} name, got '.json'"),
         ("--out {}/scene.ply/baked.ply", "scene.ply: expected a folder for the results, got a file"),
         ("--dilation 0.05", "argument --dilation: must be a number from 1/12, got 0.05"),
         ("--dilation x", "argument --dilation: must be a number from 1/12, got x"),

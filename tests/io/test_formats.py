@@ -468,7 +468,7 @@ def test_compressed_scenes_that_cannot_be_read(tmp_path, change, message):
 
 # ------------------------------------------------------------------------ what a scene says of itself
 
-HOLDING = ["a.ply", "a.compressed.ply", "a.spz", "a.glb", "a.gltf"]
+HOLDING = ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.gltf"]
 METADATA = {
     "nothing": io.SceneMetadata(),
     "trained with moment": io.SceneMetadata(footprint="moment:samples=16"),

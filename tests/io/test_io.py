@@ -146,9 +146,7 @@ def test_scenes_with_gradients_are_saved(tmp_path):
 
 
 def test_save_scene_refuses_other_suffixes(tmp_path):
-    with pytest.raises(
-        io.SceneError, match=r"expected a \.ply, \.compressed\.ply, \.spz, .* or \.gltf name, got '\.obj'"
-    ):
+    with pytest.raises(io.SceneError, match=r"expected a \.ply, \.compressed\.ply, .* or meta\.json name, got '\.obj'"):
         io.save_scene(tmp_path / "scene.obj", random_gaussians())
 
 
@@ -184,7 +182,10 @@ def text_file(tmp_path, name, text):
     ("write", "message"),
     [
         (lambda d: d / "none.ply", "no such file"),
-        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply, .spz, .sog, .splat, .glb or .gltf file, got"),
+        (
+            lambda d: text_file(d, "a.obj", "ply\n"),
+            "expected a .ply, .spz, .sog, .splat, .glb, .gltf file or a meta.json, got",
+        ),
         (lambda d: hand_written(d, form="ascii"), "cut short|17 numbers in every row"),
         (
             lambda d: hand_written(d, columns=[c for c in ply_columns(0) if c != "opacity"]),

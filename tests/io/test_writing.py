@@ -47,6 +47,7 @@ WRITERS = {
     "a.ply": lambda path: io.save_scene(path, scene()),
     "a.compressed.ply": lambda path: io.save_scene(path, scene()),
     "a.spz": lambda path: io.save_scene(path, scene(), io.SceneMetadata(footprint="moment")),
+    "a.sog": lambda path: io.save_scene(path, scene()),
     "a.glb": lambda path: io.save_scene(path, scene()),
     "a.splat": lambda path: io.save_scene(path, scene()),
     "views.json": lambda path: io.save_views(path, views()),
