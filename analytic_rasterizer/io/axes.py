@@ -16,12 +16,12 @@ import numpy as np
 OWN_LINE = ["analytic_rasterizer", "axes"]  # the first words of the line that names the axes of a file
 AXES = tuple(map("".join, product("rl", "du", "fb")))
 MEMORY = "rdf"
-OF_FORMATS = {"spz": "rub", "gltf": "luf", "glb": "luf"}
+OF_FORMATS = {"spz": "rub", "gltf": "luf", "glb": "luf", "usd": "rub"}
 """Axes of formats that are not RDF, as other programs write and read them.
 
 An .spz is RUB by its documents. Those of glTF say y-up, and that models face +z. Scenes are turned to LUF by
 splat-transform (PlayCanvas), by the documents of .spz, and by the extension that stores an .spz in a glTF (Cesium).
-Viewers (Babylon, PlayCanvas, three.js, Cesium, Blender) place them as any glTF.
+Viewers (Babylon, PlayCanvas, three.js, Cesium) place them as any glTF. A USD is y-up, and its cameras look along -z.
 """
 
 

@@ -16,6 +16,10 @@ FORMATS = {
     ".splat": "splat",
     ".glb": "gltf",
     ".gltf": "gltf",
+    ".usd": "usd",
+    ".usda": "usd",
+    ".usdc": "usd",
+    ".usdz": "usd",
 }
 """Formats of scenes, by `suffix_of`."""
 
@@ -32,7 +36,7 @@ def scene_file(path) -> tuple[Path, str]:
         raise SceneError(f"{path}: no such file")
     suffix = suffix_of(path)
     if suffix not in FORMATS:
-        expected = "a .ply, .spz, .sog, .splat, .glb, .gltf file or a meta.json"
+        expected = "a .ply, .spz, .sog, .splat, .glb, .gltf, .usd file or a meta.json"
         raise SceneError(f"{path}: expected {expected}, got {path.suffix or 'no suffix'!r}")
     check_content(path)
     return path, FORMATS[suffix]

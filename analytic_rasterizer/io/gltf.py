@@ -23,7 +23,7 @@ from ..cameras.rotations import rotation_matrices
 from ..gaussians import SH_C0
 from .axes import with_axes
 from .errors import SceneError, naming, unreadable
-from .turning import quaternion_of, turned_harmonics, turned_quaternions
+from .turning import joined, placed
 
 NAME = "KHR_gaussian_splatting"
 KERNEL, COLORS = "ellipse", "srgb_rec709_display"
@@ -36,7 +36,6 @@ TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 SIGNED, UNSIGNED, ANY = (5126, 5120, 5122), (5126, 5121, 5123), tuple(TYPES)
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 FEWEST_BYTES = 16  # of a Gaussian: what a file shows more often than that is refused, before memory is taken
-TOLERANCE = 1e-4  # relative, of a node's matrix from a rotation with one scale
 AXES_BEFORE = "rub"  # of files of versions that did not write their axes
 
 
@@ -110,11 +109,8 @@ class _Reader:
         size = sum(map(len, self.buffers.values()))
         if rows > size / FEWEST_BYTES:
             raise SceneError(f"cut short: {rows} Gaussians are too many for {size} bytes")
-        parts = [_placed(self._gaussians(primitive), matrix) for matrix, primitive in shown]
-        bands = max(part["shs"].shape[1] for part in parts)
-        for part in parts:
-            part["shs"] = np.pad(part["shs"], ((0, 0), (0, bands - part["shs"].shape[1]), (0, 0)))
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        parts = [placed(self._gaussians(primitive), matrix) for matrix, primitive in shown]
+        return joined(parts)
 
     def _item(self, kind: str, index: Any) -> dict[str, Any]:
         if type(index) is not int or not 0 <= index < len(self.json[kind]):
@@ -237,27 +233,6 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     matrix[:3, :3] = rotation * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
     matrix[:3, 3] = node.get("translation", [0, 0, 0])
     return matrix
-
-
-def _placed(fields: dict[str, np.ndarray], matrix: np.ndarray) -> dict[str, np.ndarray]:
-    """Gaussians where the (4, 4) matrix puts them. Raises SceneError where they would be Gaussians no more."""
-    linear = matrix[:3, :3]
-    scale = np.cbrt(np.linalg.det(linear))
-    if not (np.isfinite(matrix).all() and scale > 0):
-        raise SceneError("a node mirrors its Gaussians, or has a scale of 0: not read")
-    error = np.abs(linear.T @ linear / scale**2 - np.eye(3)).max()
-    if not error < TOLERANCE or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise SceneError("a node scales its Gaussians differently along axes, or shears them: not read")
-    quaternion = quaternion_of(linear / scale)
-    with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out later
-        means = fields["means"] @ linear.T + matrix[:3, 3]
-    return {
-        "means": means,
-        "log_scales": fields["log_scales"] + np.log(scale),
-        "rotations": turned_quaternions(quaternion, fields["rotations"]),
-        "logit_opacities": fields["logit_opacities"],
-        "shs": turned_harmonics(quaternion, fields["shs"]),
-    }
 
 
 def to_gltf(fields: dict[str, np.ndarray], lines: Sequence[str], binary: bool) -> bytes:

@@ -1,7 +1,7 @@
 """Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
 
 A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json (extras), a glTF in
-its asset.extras. A .splat holds none.
+its asset.extras, a USD in its customLayerData. A .splat holds none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..footprints import COMPENSATED, DILATED, resolve_footprint
-from . import gltf, ply, sog, spz
+from . import gltf, ply, sog, spz, usd
 from .axes import axes_in, axes_of_format, checked_axes
 from .errors import first_line
 from .formats import scene_file
@@ -138,9 +138,9 @@ def read_metadata(path) -> SceneMetadata:
 def read_axes(path) -> str:
     """The axes of the numbers in the file `path` of a scene, such as "rub": what it says, or those of its format.
 
-    `load_scene` turns them to RDF. Of a .ply, .splat or .sog that says nothing they are RDF, of an .spz RUB, and of a
-    glTF LUF. Before axes were written, this package wrote RDF into an .spz and RUB into a glTF. Such files are known by
-    our lines in them, but for an .spz without metadata.
+    `load_scene` turns them to RDF. Of a .ply, .splat or .sog that says nothing they are RDF, of an .spz or USD RUB, and
+    of a glTF LUF. Before axes were written, this package wrote RDF into an .spz and RUB into a glTF. Such files are
+    known by our lines in them, but for an .spz without metadata.
 
     Raises:
         SceneError: As `read_metadata`.
@@ -157,6 +157,8 @@ def _read_lines(path: Path, kind: str) -> tuple[bool | None, Sequence[str]]:
         return sog.read_metadata(path)
     if kind == "gltf":
         return None, gltf.read_lines(path)
+    if kind == "usd":
+        return None, usd.read_lines(path)
     if kind == "splat":
         return None, []
     return None, ply.read_header(path).comments

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
-from . import gltf, ply, sog, splat, spz
+from . import gltf, ply, sog, splat, spz, usd
 from .axes import axes_of_format, checked_axes, flipped, with_axes
 from .compressed import is_compressed, read_compressed, to_compressed
 from .errors import SceneError, first_line, naming
@@ -35,15 +35,18 @@ WRITTEN = {
     ".splat": "splat",
     ".glb": "glb",
     ".gltf": "gltf",
+    ".usd": "usd",
+    ".usda": "usd",
+    ".usdc": "usd",
 }
-WRITTEN_IN_WORDS = ".ply, .compressed.ply, .spz, .sog, .splat, .glb, .gltf or meta.json"
+WRITTEN_IN_WORDS = ".ply, .compressed.ply, .spz, .sog, .splat, .glb, .gltf, .usd, .usda, .usdc or meta.json"
 FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
 
 def load_scene(path, strict: bool = False, axes: str | None = None) -> Gaussians:
     """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic), a .splat
-    or a glTF (.glb, .gltf).
+    a glTF (.glb, .gltf), or OpenUSD with Gaussians (.usd, .usda, .usdc, .usdz).
 
     A .ply may be text or have either byte order, any types, and any other elements and properties. Red, green and blue
     are read where there are no harmonics, as those of degree 0.
@@ -64,7 +67,7 @@ def load_scene(path, strict: bool = False, axes: str | None = None) -> Gaussians
         SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
             the file.
         ValueError: Unknown axes.
-        ImportError: The extra `cli` is missing, which formats other than .ply, .splat and glTF need.
+        ImportError: The extra `cli` is missing, which formats other than .ply, .splat and glTF need, or `usd`.
     """
     path, kind = scene_file(path)
     axes = None if axes is None else checked_axes(axes)
@@ -74,6 +77,7 @@ def load_scene(path, strict: bool = False, axes: str | None = None) -> Gaussians
         "sog": sog.read_sog,
         "splat": splat.read_splat,
         "gltf": gltf.read_gltf,
+        "usd": usd.read_usd,
     }
     try:
         fields = flipped(readers[kind](path), axes or read_axes(path))
@@ -174,7 +178,7 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
 
 def written_format(path) -> str:
     """The format that `save_scene` writes under the name `path`: "ply", "compressed", "spz", "sog", "splat", "glb",
-    or "gltf".
+    "gltf" or "usd".
 
     Raises:
         SceneError: It writes none under this name.
@@ -188,7 +192,8 @@ def written_format(path) -> str:
 
 
 def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, axes: str | None = None) -> None:
-    """Writes a scene as .ply, .compressed.ply, .spz (version 3), .sog (version 2), .splat, .glb or .gltf, by its name.
+    """Writes a scene as .ply, .compressed.ply, .spz (version 3), .sog (version 2), .splat, .glb, .gltf or
+    .usd, by its name.
 
     A .ply holds the parameters as they are, but for infinite logits: opacities are then kept off 0 and 1 by 1e-6. The
     other formats round (docs/library.md says how), and hold unit quaternions. A .sog changes the order of the
@@ -204,10 +209,10 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
 
     Raises:
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
-            harmonics of degree 4 in an .spz, .sog or glTF; no Gaussians in a .sog or glTF; metadata or axes that
+            harmonics of degree 4 in an .spz, .sog, glTF or USD; no Gaussians in these but .spz; metadata or axes that
             cannot be written; in all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
         OSError: The file cannot be written; an earlier one is then unchanged.
-        ImportError: The extra `cli` is missing, which .compressed.ply, .spz and .sog need.
+        ImportError: The extra `cli` is missing, which .compressed.ply, .spz and .sog need, or `usd`.
     """
     path, kind = Path(path), written_format(path)
     if not isinstance(metadata, (SceneMetadata, type(None))):
@@ -242,6 +247,9 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
         write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
+    elif kind == "usd":
+        usd.pxr("UsdVol")  # raises
+        write_safely(path, lambda temporary: usd.write_usd(temporary, fields, lines))
     elif kind == "sog":
         write_sog(path, fields, metadata.antialiased, lines)
     else:
@@ -265,10 +273,10 @@ def _check(scene: Gaussians, kind: str) -> None:
         field = getattr(scene, name)
         if field.shape != (count, *row):
             raise SceneError(f"{name} must have shape {(count, *row)}, got {tuple(field.shape)}")
-    if scene.sh_degree > 4 or (kind in ("spz", "sog", "glb", "gltf") and scene.sh_degree > 3):
+    if scene.sh_degree > 4 or (kind in ("spz", "sog", "glb", "gltf", "usd") and scene.sh_degree > 3):
         raise SceneError(f"harmonics of degree {scene.sh_degree} have no place in this format; a .ply holds degree 4")
-    if kind in ("sog", "glb", "gltf") and not count:
-        name = ".sog" if kind == "sog" else "glTF"
+    if kind in ("sog", "glb", "gltf", "usd") and not count:
+        name = {"sog": ".sog", "usd": "USD"}.get(kind, "glTF")
         raise SceneError(f"a {name} has no place for a scene without Gaussians; a .ply has")
     for name, field in numbers_of(scene).items() if kind != "ply" else ():
         good = field.flatten(1).isfinite().all(1)

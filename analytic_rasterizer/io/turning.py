@@ -1,4 +1,4 @@
-"""Turning Gaussians: quaternions (w, x, y, z), and harmonics up to degree 3 with them, in float64."""
+"""Placing and turning Gaussians: quaternions (w, x, y, z), and harmonics up to degree 3 with them, in float64."""
 
 from __future__ import annotations
 
@@ -6,8 +6,39 @@ import numpy as np
 import torch
 
 from ..cameras.rotations import quaternion, rotation_matrices
+from .errors import SceneError
 
+TOLERANCE = 1e-4  # relative, of a node's matrix from a rotation with one scale
 SAMPLES = 64  # directions, more than the 16 harmonics
+
+
+def placed(fields: dict[str, np.ndarray], matrix: np.ndarray) -> dict[str, np.ndarray]:
+    """Gaussians where the (4, 4) matrix puts them. Raises SceneError where they would be Gaussians no more."""
+    linear = matrix[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    if not (np.isfinite(matrix).all() and scale > 0):
+        raise SceneError("a node mirrors its Gaussians, or has a scale of 0: not read")
+    error = np.abs(linear.T @ linear / scale**2 - np.eye(3)).max()
+    if not error < TOLERANCE or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise SceneError("a node scales its Gaussians differently along axes, or shears them: not read")
+    quaternion = quaternion_of(linear / scale)
+    with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out later
+        means = fields["means"] @ linear.T + matrix[:3, 3]
+    return {
+        "means": means,
+        "log_scales": fields["log_scales"] + np.log(scale),
+        "rotations": turned_quaternions(quaternion, fields["rotations"]),
+        "logit_opacities": fields["logit_opacities"],
+        "shs": turned_harmonics(quaternion, fields["shs"]),
+    }
+
+
+def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Gaussians of several parts, with harmonics of the highest of their degrees."""
+    bands = max(part["shs"].shape[1] for part in parts)
+    for part in parts:
+        part["shs"] = np.pad(part["shs"], ((0, 0), (0, bands - part["shs"].shape[1]), (0, 0)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:

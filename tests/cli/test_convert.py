@@ -24,9 +24,9 @@ def test_any_format_to_any(tmp_path, capsys):
         assert io.read_metadata(target).background == (1, 1, 1)
         last = target
     found = io.load_scene(last)
-    by_x = lambda scene: scene.rows(scene.means[:, 0].argsort())  # noqa: E731: a .sog has another order
-    assert (by_x(found).means - by_x(scene).means).abs().max() < 0.01
-    assert (by_x(found).shs - by_x(scene).shs).abs().max() < 0.06
+    found, scene = (each.rows(each.means[:, 0].argsort()) for each in (found, scene))  # a .sog has another order
+    assert (found.means - scene.means).abs().max() < 0.01
+    assert (found.shs - scene.shs).abs().max() < 0.06
     out = capsys.readouterr().out.splitlines()
     assert (
         out[2] == f"{tmp_path / 'circle/a.spz'}: 40 Gaussians, harmonics of degree 0, axes rub, footprint box:samples=4"

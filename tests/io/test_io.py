@@ -184,7 +184,7 @@ def text_file(tmp_path, name, text):
         (lambda d: d / "none.ply", "no such file"),
         (
             lambda d: text_file(d, "a.obj", "ply\n"),
-            "expected a .ply, .spz, .sog, .splat, .glb, .gltf file or a meta.json, got",
+            "expected a .ply, .spz, .sog, .splat, .glb, .gltf, .usd file or a meta.json, got",
         ),
         (lambda d: hand_written(d, form="ascii"), "cut short|17 numbers in every row"),
         (
