@@ -98,7 +98,7 @@ def run_table(
                 skipped.append(missing)
                 continue
             values = preset_values(preset, table.options["scales"]) | changes | table.training_options(row, scene)
-            values["effects"] = "none"
+            values |= {"effects": "none", "pixels_per_gaussian": 0.0}  # of no protocol
             folder = Path(out) / table.training / row.name / scene
             jobs.append(Job(row, scene, place, folder, TrainingOptions(**values)))
     skipped = list(dict.fromkeys(skipped))

@@ -74,7 +74,7 @@ def test_public_names():
     assert all(hasattr(ar, name) for name in ar.__all__)
 
 
-def test_import_under_the_name_existing_code_uses():
+def test_import_under_the_name_existing_code_uses(nothing_chosen):
     import diff_gaussian_rasterization as drop_in
 
     # Classes of their own, which follow a dialect (test_dialects.py); those of the library do not.

@@ -438,6 +438,7 @@ def test_the_program_prints_the_table_and_measures_lpips_as_the_paper_did(blende
     assert "Departs from the protocol: preset quick, iterations = 1, seed = 4." in captured.out
     options = json.loads((tmp_path / "out" / "blender-single" / "box" / "lego" / files.OPTIONS).read_text())["options"]
     protocol = {"footprint": "box:samples=4", "downsampling": "blender", "effects": "none"}
+    protocol |= {"pixels_per_gaussian": 0.0}
     quick = replace(TrainingOptions.preset("quick"), iterations=1, seed=4, **protocol)
     assert TrainingOptions.from_dict(options) == quick
     # With the network there, another call measures it, and trains nothing.
