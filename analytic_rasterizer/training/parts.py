@@ -225,8 +225,8 @@ class StartOptions(Options):
     pixels_per_gaussian: float = option(
         16.0,
         "Pixels of all training pictures, at the finest scale, for each Gaussian: a lower limit than the default of "
-        "`max_gaussians` where pictures are few or small. It leaves the Gaussians of the start, and holds only where "
-        "`max_gaussians` has its default. 0: no such limit.",
+        "`max_gaussians` where pictures are few or small. It is no less than twice the Gaussians of the start, and "
+        "holds only where `max_gaussians` has its default. 0: no such limit.",
         NOT_NEGATIVE,
         metavar="PIXELS",
     )

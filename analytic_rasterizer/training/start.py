@@ -71,17 +71,16 @@ def begin(
 ) -> tuple[Gaussians, int | None, TrainingOptions, list[str]]:
     """As `first_gaussians`; and the options, with a limit of Gaussians by what the pictures can show, and what to say.
 
-    The limit takes no Gaussian of the start away: fewer random ones learn worse.
+    It is no less than twice the Gaussians of the start: fewer learn worse, also of random ones.
     """
     limit = pixel_limit(options, [item.view for item in capture.train], chosen)
     start, found = first_gaussians(options, capture, points, chosen)
     said = []
     if limit is not None:
-        options = replace(options, max_gaussians=max(limit, start.count))
-        shown = (
-            f"one for {options.pixels_per_gaussian:g} pixels of {len(capture.train)} pictures, or those of the start"
-        )
-        said.append(f"at most {options.max_gaussians:,} Gaussians, {shown} (--pixels-per-gaussian, --max-gaussians)")
+        options = replace(options, max_gaussians=max(limit, min(2 * start.count, options.max_gaussians)))
+        shown = f"one for {options.pixels_per_gaussian:g} pixels of {len(capture.train)} pictures"
+        told = f"at most {options.max_gaussians:,} Gaussians, {shown}, or twice those of the start"
+        said.append(f"{told} (--pixels-per-gaussian, --max-gaussians)")
     if points is None and capture.points is None and capture.starts_in_view:
         said.append(f"no points in the capture: starts from {start.count:,} random ones in the views (--points)")
     return start, found, options, said

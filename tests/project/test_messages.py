@@ -41,6 +41,7 @@ PRINTED_BY = {
 }
 # Texts that not all commands of their module print, by a part of them.
 ONLY = {
+    "--device cuda: no CUDA device": tuple(name for name in COMMANDS if name != "convert"),
     "larger numbers in --scales": ("render", "inspect", "pareto"),
     "use --scales, which takes reductions": ("train", "evaluate", "render", "bake", "inspect", "pareto"),
     "{} on the GPU (--picture-memory-gpu)": ("train",),
@@ -126,7 +127,7 @@ def test_the_messages_are_found():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_advice_that_a_command_cannot_follow_is_left_out(command):
-    given = {"train": "C --out D", "evaluate": "D", "view": "S", "inspect": "S", "pareto": "S"}
+    given = {"train": "C --out D", "evaluate": "D", "view": "S", "inspect": "S", "pareto": "S", "convert": "S D.ply"}
     words = f"{command} {given.get(command, 'S --out D')}".split()
     known = getattr(cli.build_parser().parse_args(words), KNOWN_OPTIONS)
     assert known == OPTIONS[command]

@@ -50,7 +50,7 @@ def test_a_training_says_it_and_keeps_it(tmp_path, capsys):
     arguments = ["train", str(tmp_path / "capture"), "--out", str(tmp_path / "out"), "--device", "cpu"]
     arguments += ["--no-evaluate", "--densify-every", "5", "--densify-from", "5", "--gradient", "1e-9"]
     assert cli.main([*arguments, "--iterations", "30", "--random-points", "300"]) == 0
-    said = "at most 1,000 Gaussians, one for 16 pixels of 10 pictures, or those of the start"
+    said = "at most 1,000 Gaussians, one for 16 pixels of 10 pictures, or twice those of the start"
     assert said in capsys.readouterr().err
     options = json.loads((tmp_path / "out" / files.OPTIONS).read_text())["options"]
     assert (options["max_gaussians"], options["random_points"]) == (start.FEWEST, 300)
@@ -64,14 +64,15 @@ def test_random_points_of_the_start_stay(tmp_path):
     """Though the pictures show fewer: with fewer a short training on lego was 1.1 dB worse."""
     write_nerf_synthetic(tmp_path / "capture", circle(10), circle(2))
     run = training.Run(tmp_path / "capture", tmp_path / "out", TrainingOptions(iterations=1, effects="none"))
-    assert run.trainer.gaussians.count == run.options.max_gaussians == run.options.random_points == 100_000
+    assert run.trainer.gaussians.count == run.options.random_points == 100_000
+    assert run.options.max_gaussians == 200_000
 
 
 def test_points_of_the_start_stay(tmp_path):
     folder = write_wall(tmp_path / "wall", cameras())
     run = training.Run(folder, tmp_path / "out", TrainingOptions(iterations=3, scales=(64,), effects="none"))
-    assert run.trainer.gaussians.count == 600 and run.options.max_gaussians == start.FEWEST
+    assert run.trainer.gaussians.count == 600 and run.options.max_gaussians == 1200
     few = training.Run(folder, tmp_path / "few", TrainingOptions(iterations=3, max_gaussians=300, effects="none"))
     assert few.trainer.gaussians.count == 300
     many = TrainingOptions(iterations=3, pixels_per_gaussian=1e9, effects="none")
-    assert training.Run(folder, tmp_path / "many", many).options.max_gaussians == start.FEWEST
+    assert training.Run(folder, tmp_path / "many", many).options.max_gaussians == 1200
