@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from .errors import SceneError, naming, optional_import, unreadable
+from .formats import SOG_META
 
-META = "meta.json"
 OWN = "analytic_rasterizer"  # the key of its extras that holds lines, those of a .ply's comments
 FIRST_MODE = 252  # of a quaternion's fourth byte, which names the largest component
 PER_ROW = 64  # entries of the palette in a row of its picture
@@ -65,13 +65,13 @@ def _opened(path: Path) -> Iterator[Callable[[str], bytes]]:
     def read(name: str) -> bytes:
         if Path(name).name != name:
             raise SceneError(f"expected the name of a file beside it, got {name!r}")
-        return (path if name == META else path.with_name(name)).read_bytes()
+        return (path if name == SOG_META else path.with_name(name)).read_bytes()
 
     yield read
 
 
 def _meta(read: Callable[[str], bytes]) -> dict[str, Any]:
-    meta = json.loads(read(META))
+    meta = json.loads(read(SOG_META))
     if not isinstance(meta, dict):
         raise SceneError(f"meta.json must hold an object, got {type(meta).__name__}")
     return meta

@@ -16,7 +16,9 @@ import numpy as np
 
 from .codebooks import codebook, nearest, palette
 from .errors import optional_import
-from .sog import FIRST_MODE, META, OWN, PER_ROW
+from .formats import SOG_META
+from .morton import morton_order
+from .sog import FIRST_MODE, OWN, PER_ROW
 from .writing import write_bytes, write_safely
 
 MOST_ENTRIES = 1 << 16  # of the palette: an index has two bytes
@@ -51,7 +53,7 @@ def write_sog(path: Path, fields: dict[str, np.ndarray], antialiased: bool | Non
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w") as archive:  # pictures are compressed already
-            for name, content in {META: text, **contents}.items():
+            for name, content in {SOG_META: text, **contents}.items():
                 archive.writestr(zipfile.ZipInfo(name), content)
 
     write_safely(path, write)
@@ -59,7 +61,7 @@ def write_sog(path: Path, fields: dict[str, np.ndarray], antialiased: bool | Non
 
 def encoded(fields: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The pictures by their names, (height, width, 3 or 4) bytes, and what meta.json says of them."""
-    order = morton_order(fields["means"])
+    order = _order(fields["means"])
     fields = {name: field[order] for name, field in fields.items()}
     count = len(order)
     width = -(-int(np.ceil(np.sqrt(count))) // 4) * 4
@@ -95,15 +97,10 @@ def encoded(fields: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[
     return pictures, meta
 
 
-def morton_order(means: np.ndarray) -> np.ndarray:
-    """(N,) indices that put positions along a Z-shaped curve through a grid of 1024^3 cells."""
+def _order(means: np.ndarray) -> np.ndarray:
+    """(N,) indices along a Morton curve through a grid of 1024^3 cells."""
     low, high = means.min(0).astype(np.float64), means.max(0).astype(np.float64)
-    cells = ((means - low) / np.where(high > low, high - low, 1) * 1023).astype(np.uint64)
-    code = np.zeros(len(means), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return morton_order((means - low) / np.where(high > low, high - low, 1) * 1023, 10)
 
 
 def _means(means: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:

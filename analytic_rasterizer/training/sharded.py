@@ -150,24 +150,18 @@ class ShardedTrainer(Trainer):
         )
         by_camera, losses = [], [] if shapes.penalty is None else [shapes.penalty]
         for camera, (rows, background, image) in zip(step.route.own, step.exchange()):
-            picture = shown[camera]
-            truth = self.pictures.target(picture.scale, picture.view, picture.background)
-            mask = self.pictures.mask(picture.scale, picture.view)
+            compared = self._comparison(shown[camera])
             loss, drawn, dL_drows = _rows_picture_gradients(
                 rows=rows,
-                target=truth,
                 dL_dloss=self.dL_dloss / self.stride,
-                exposure=None,
-                mask=mask,
-                ssim_weight=options.ssim_weight,
-                supersampling=options.supersampling,
                 bg=background,
                 absolute=step.absolute,
+                **compared,
                 **image,
             )
             by_camera.append(dL_drows)
             losses.append(loss / len(shown))
-            self._last = drawn, truth, mask
+            self._last = drawn, compared["target"], compared["mask"]
         own = step.exchange_back(by_camera)
         shapes.differentiate(step.gradients(own))
         splats = step.own

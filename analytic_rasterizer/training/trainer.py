@@ -279,24 +279,28 @@ class Trainer:
         """The loss of a picture with the regularizers, its radii, and gradients in the order of `picture_gradients`."""
         options = self.options
         opacity_weight, scale_weight = options.regularizers
-        truth = self.pictures.target(shown.scale, shown.view, shown.background)
-        mask = self.pictures.mask(shown.scale, shown.view)
+        compared = self._comparison(shown)
         given = {
             "mean_columns": self.density.columns if self._watches(shown.scale) else 0,
-            "target": truth,
             "dL_dloss": self.dL_dloss,
-            "exposure": None if self.exposures is None else self.exposures.matrices[shown.view],
-            "mask": mask,
-            "ssim_weight": options.ssim_weight,
             "filter_3d": self.filter_3d,
-            "supersampling": options.supersampling,
             "opacity_weight": opacity_weight,
             "scale_weight": scale_weight,
         }
-        made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **self._camera(shown))
+        made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **compared, **self._camera(shown))
         loss, image, radii, gradients = made
-        self._last = image, truth, mask
+        self._last = image, compared["target"], compared["mask"]
         return loss, radii, gradients
+
+    def _comparison(self, shown: Shown) -> dict[str, Any]:
+        """How a rendering becomes a loss, by the names of the ops."""
+        return {
+            "target": self.pictures.target(shown.scale, shown.view, shown.background),
+            "exposure": None if self.exposures is None else self.exposures.matrices[shown.view],
+            "mask": self.pictures.mask(shown.scale, shown.view),
+            "ssim_weight": self.options.ssim_weight,
+            "supersampling": self.options.supersampling,
+        }
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
         """Camera and footprint of a picture by the names of the ops; made once for every picture and degree."""
@@ -341,7 +345,7 @@ class Trainer:
             for scale, settings in self._settings().items():
                 background = settings[0].bg if self.random_background else None
                 self._differentiate_picture(Shown(scale, 0, settings[0]._replace(footprint=footprint), background))
-                self._cameras = {}
+            self._cameras = {}
         self._last = None
 
     def take_losses(self) -> list[float]:

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 
 from ..cameras.rotations import rotation_matrices
+from ..io.morton import morton_order
 from .compact import LARGEST_HALF
 from .packing import GEOMETRY_WIDTH, PackedScene
 
@@ -140,12 +141,8 @@ def _morton_order(means: np.ndarray) -> np.ndarray:
     bits = 20
     low, high = np.quantile(means, [0.005, 0.995], axis=0)
     side = max((high - low).max(), SMALLEST_SCALE)
-    places = ((means - low) / side * (2**bits - 1)).clip(0, 2**bits - 1).astype(np.int64)
-    key = np.zeros(len(means), np.int64)
-    for bit in range(bits):
-        for axis in range(3):
-            key |= (places[:, axis] >> bit & 1) << 3 * bit + axis
-    return np.argsort(key, kind="stable")
+    places = ((means - low) / side * (2**bits - 1)).clip(0, 2**bits - 1)
+    return morton_order(places, bits)
 
 
 def _nearest_to_identity(scales: np.ndarray, quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

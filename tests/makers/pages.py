@@ -9,6 +9,7 @@ import torch
 
 from analytic_rasterizer import io, render_stages, viewer
 from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.viewer.compressed import compress, decompress
 from analytic_rasterizer.viewer.packing import PAGE_ENTRIES
 
 PATIENCE = 600
@@ -53,6 +54,13 @@ def gaussians_of(packed):
     harmonics = torch.frombuffer(bytearray(packed.harmonics), dtype=torch.float16).reshape(len(geometry), -1).float()
     shs = harmonics[:, : 3 * (packed.meta["sh_degree"] + 1) ** 2].unflatten(1, (-1, 3))
     return Gaussians.from_activated(geometry[:, :3], geometry[:, 4:7], geometry[:, 8:], geometry[:, 3:4], shs)
+
+
+def export_rounded(path, scene, view, **options):
+    """Writes a file of the scene, and returns the scene that it holds."""
+    packed = viewer.pack_scene(scene, [view], **options)
+    viewer.export_page(path, packed)
+    return gaussians_of(decompress(packed.meta, *compress(packed)))
 
 
 def rendered(scene, view, footprint, background=(0.0, 0.0, 0.0)):

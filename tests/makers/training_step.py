@@ -12,30 +12,49 @@ from analytic_rasterizer.losses import l1_ssim
 TOLERANCE = 3e-4
 
 
+def widened(arguments: dict[str, torch.Tensor], filter_3d: torch.Tensor | None) -> dict[str, torch.Tensor]:
+    """`Gaussians.arguments` with the 3D filter, where there is one."""
+    if filter_3d is None:
+        return arguments
+    made = ar.apply_3d_filter(arguments["scales"], arguments["opacities"], filter_3d)
+    return arguments | dict(zip(("scales", "opacities"), made))
+
+
+def compared(settings, gaussians, means2D, target, *, times, exposure, mask, ssim_weight):
+    """The loss of a picture, the picture that is compared, and the radii.
+
+    Args:
+        settings: Of the rendering, which is `times` as large as the target.
+        gaussians: Arguments of the rasterizer.
+    """
+    picture, radii = ar.GaussianRasterizer(settings)(means2D=means2D, **gaussians)
+    picture = avg_pool2d(picture, times)
+    if exposure is not None:
+        picture = torch.einsum("ij,jhw->ihw", exposure[:, :3], picture) + exposure[:, 3, None, None]
+    return l1_ssim(picture, target, ssim_weight, mask), picture, radii
+
+
 def by_autograd(trainer) -> dict[str, torch.Tensor]:
     """Loss and gradients of the next step, sums of density control after it, and gradients of exposures by view."""
     options, gaussians = trainer.options, trainer.gaussians.map(lambda field: field.detach().requires_grad_())
     state = trainer.generator.get_state()
     pictures, times = trainer._next(), options.supersampling
     trainer.generator.set_state(state)
-    arguments, shown_as = gaussians.arguments(), gaussians.arguments()
-    if trainer.filter_3d is not None:
-        filtered = ar.apply_3d_filter(shown_as["scales"], shown_as["opacities"], trainer.filter_3d)
-        shown_as |= dict(zip(("scales", "opacities"), filtered))
+    arguments = gaussians.arguments()
+    shown_as = widened(arguments, trainer.filter_3d)
     losses, leaves, exposures = [], [], {}
     for shown in pictures:
         size = {"image_height": times * shown.settings.image_height, "image_width": times * shown.settings.image_width}
         leaves.append(
             torch.zeros(len(gaussians.means), trainer.density.columns, device=trainer.device).requires_grad_()
         )
-        picture, _ = ar.GaussianRasterizer(shown.settings._replace(**size))(means2D=leaves[-1], **shown_as)
-        picture = avg_pool2d(picture, times)
+        matrix = None
         if trainer.exposures is not None:
             matrix = exposures.setdefault(shown.view, trainer.exposures.matrices[shown.view].clone().requires_grad_())
-            picture = torch.einsum("ij,jhw->ihw", matrix[:, :3], picture) + matrix[:, 3, None, None]
         target = trainer.pictures.target(shown.scale, shown.view, shown.background)
-        mask = trainer.pictures.mask(shown.scale, shown.view)
-        losses.append(l1_ssim(picture, target, options.ssim_weight, mask))
+        mask, weight = trainer.pictures.mask(shown.scale, shown.view), options.ssim_weight
+        how = {"times": times, "exposure": matrix, "mask": mask, "ssim_weight": weight}
+        losses.append(compared(shown.settings._replace(**size), shown_as, leaves[-1], target, **how)[0])
     opacity_weight, scale_weight = options.regularizers
     penalty = opacity_weight * arguments["opacities"].mean() + scale_weight * arguments["scales"].mean()
     loss = torch.stack(losses).mean() + penalty

@@ -25,9 +25,8 @@ from ply_files import ply, vertices
 from processes import DEADLINE
 from runs import around_steps, rows_shown, scatter
 from train_extra import image
-from training_step import TOLERANCE, check_next_step
+from training_step import TOLERANCE, check_next_step, compared, widened
 
-import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, optim, training
 from analytic_rasterizer.cameras.lens import Lens
 from analytic_rasterizer.filters import bake_pixel
@@ -496,18 +495,12 @@ def test_gradients_of_a_picture_are_those_of_autograd(device, lens, parts, colum
     times, weights = given["supersampling"], (given.get("opacity_weight", 0), given.get("scale_weight", 0))
     parameters = Gaussians(*(given[name] for name in FIELDS)).map(lambda field: field.clone().requires_grad_())
     means2D = torch.zeros(len(radii), max(columns, 3), device=device, requires_grad=True)
-    arguments, shown = parameters.arguments(), parameters.arguments()
-    if "filter_3d" in given:
-        widened = ar.apply_3d_filter(shown["scales"], shown["opacities"], given["filter_3d"])
-        shown |= dict(zip(("scales", "opacities"), widened))
+    arguments = parameters.arguments()
+    shown = widened(arguments, given.get("filter_3d"))
+    exposure = given["exposure"] if given["exposure"] is None else given["exposure"].clone().requires_grad_()
+    how = {"times": times, "exposure": exposure, "mask": given["mask"], "ssim_weight": given["ssim_weight"]}
     settings = settings_of(lens, device)._replace(bg=given["bg"])
-    image, expected_radii = ar.GaussianRasterizer(settings)(means2D=means2D, **shown)
-    image = torch.nn.functional.avg_pool2d(image, times)
-    exposure = given["exposure"]
-    if exposure is not None:
-        exposure = exposure.clone().requires_grad_()
-        image = torch.einsum("ij,jhw->ihw", exposure[:, :3], image) + exposure[:, 3, None, None]
-    expected = l1_ssim(image, given["target"], given["ssim_weight"], given["mask"])
+    expected, image, expected_radii = compared(settings, shown, means2D, given["target"], **how)
     expected = expected + weights[0] * arguments["opacities"].mean() + weights[1] * arguments["scales"].mean()
     wanted = [*parameters, *([means2D] if columns else []), *([] if exposure is None else [exposure])]
     made = torch.autograd.grad(expected, wanted, given["dL_dloss"])

@@ -36,7 +36,7 @@ from pages import (
     ROOT_MEAN_SQUARE_OF_HALVES,
     WEBGL_FOOTPRINTS,
     assert_same,
-    gaussians_of,
+    export_rounded,
     random_scene,
     rendered,
     serve,
@@ -47,7 +47,6 @@ from places import SHARED
 import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import io, viewer
-from analytic_rasterizer.viewer.compressed import compress, decompress
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-browser")
 
@@ -176,9 +175,7 @@ def test_what_the_screen_shows_is_the_picture(browser):
 def test_a_compressed_file_is_near_without_network(browser, tmp_path):
     scene, view = random_scene(500), turned_view()
     path = tmp_path / "a scene.html"
-    packed = viewer.pack_scene(scene, [view], footprint="mip")
-    viewer.export_page(path, packed)
-    rounded = gaussians_of(decompress(packed.meta, *compress(packed)))
+    rounded = export_rounded(path, scene, view, footprint="mip")
     with open_page(browser, f"{path.as_uri()}?view=0", offline=True) as page:
         wait_until_ready(page)
         assert_same(pixels(page, view.width, view.height), rendered(rounded, view, "mip"))

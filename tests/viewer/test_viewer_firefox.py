@@ -22,7 +22,7 @@ from pages import (
     REDUCTIONS,
     WEBGL_FOOTPRINTS,
     assert_same,
-    gaussians_of,
+    export_rounded,
     random_scene,
     rendered,
     serve,
@@ -30,8 +30,6 @@ from pages import (
 )
 
 import demo
-from analytic_rasterizer import viewer
-from analytic_rasterizer.viewer.compressed import compress, decompress
 
 PREFERENCES = {
     "webgl.force-enabled": True,  # also on a device that is only software
@@ -192,10 +190,8 @@ def test_pictures(settled, footprint, reduction):
 
 def test_an_exported_file_looks_the_same(firefox, tmp_path):
     scene, view = random_scene(500), turned_view()
-    packed = viewer.pack_scene(scene, [view])
-    viewer.export_page(tmp_path / "scene.html", packed)
+    rounded = export_rounded(tmp_path / "scene.html", scene, view)
     firefox.open_settled(f"{(tmp_path / 'scene.html').as_uri()}?view=0")
-    rounded = gaussians_of(decompress(packed.meta, *compress(packed)))
     assert_same(firefox.pixels(view.width, view.height), rendered(rounded, view, "analytic"))
 
 

@@ -26,12 +26,11 @@ from chromium import (
     wait_for_frame,
     wait_until_ready,
 )
-from pages import assert_same, gaussians_of, random_scene, rendered, serve, turned_view
+from pages import assert_same, export_rounded, random_scene, rendered, serve, turned_view
 
 import demo
 from analytic_rasterizer import viewer
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.viewer.compressed import compress, decompress
 
 ADAPTER = "async () => (await navigator.gpu?.requestAdapter())?.info.isFallbackAdapter ?? null"
 DEVICES = """
@@ -320,9 +319,7 @@ def test_a_picture_whose_device_is_lost_is_drawn_again(browser):
 def test_an_exported_file_draws_moment_without_network(browser, tmp_path):
     scene, view = random_scene(500), facing()
     path = tmp_path / "scene.html"
-    packed = viewer.pack_scene(scene, [view], footprint="moment")
-    viewer.export_page(path, packed)
-    rounded = gaussians_of(decompress(packed.meta, *compress(packed)))
+    rounded = export_rounded(path, scene, view, footprint="moment")
     with open_page(browser, f"{path.as_uri()}?view=0&renderer=webgpu", offline=True) as page:
         wait_until_ready(page)
         assert_same(pixels(page, view.width, view.height), rendered(rounded, view, "moment:samples=4"))
