@@ -8,12 +8,10 @@
 #include <cstddef>
 #include <new>
 #include <string>
-#include <tuple>
 #include <utility>
 #include <vector>
 
 #include "core/footprint/registry.h"
-#include "core/project.h"
 #include "core/sh.h"
 #include "core/ssim.h"
 #include "cpu/stages.h"

@@ -70,8 +70,8 @@ struct CopyOpacity {
     const Tensor light = x.neg().exp(), hidden = light.neg().add(1), left = falloff.mul(hidden).neg().add(1);
     return {hidden, left, falloff.mul(light).div(left).sum(0).mul(2).add(1)};
   }
-  Tensor step(const Tensor& x) const {
-    const At here = at(x);
+  Tensor step(const Tensor& x) const { return step(x, at(x)); }
+  Tensor step(const Tensor& x, const At& here) const {
     return wanted.sub(x).add(here.left.log().sum(0).mul(2)).div(here.slope).add(x);
   }
 };
@@ -171,7 +171,7 @@ Results repeat_at_seam_vjp(VjpArguments<SeamArguments> arguments) {
     // By the last step alone, whose derivative is that of the solution.
     const CopyOpacity::At here = equation.at(solution);
     const Tensor dL_dwanted =
-        at::where(overlaps, dL_dopacities.mul(equation.step(solution).neg().exp()).div(here.slope), 0);
+        at::where(overlaps, dL_dopacities.mul(equation.step(solution, here).neg().exp()).div(here.slope), 0);
     const Tensor dL_dfalloff = dL_dwanted.mul(-2).mul(here.hidden).div(here.left);
     Tensor dL_dsquare = nothing;
     for (int k = 1; k <= kNeighbours; ++k)
