@@ -14,12 +14,12 @@ from cli_extra import image
 from gaussians import random_gaussians
 
 from analytic_rasterizer import io
+from analytic_rasterizer.io import sog_writer
 from analytic_rasterizer.io.codebooks import codebook, nearest, palette
-from analytic_rasterizer.io.sog_writer import morton_order
 
 
 def in_its_order(scene):
-    return scene.rows(torch.from_numpy(morton_order(scene.means.numpy())))
+    return scene.rows(torch.from_numpy(sog_writer._order(scene.means.numpy())))
 
 
 def pictures_of(path):
