@@ -13,12 +13,12 @@ import sys
 from .. import _C, __version__
 from ..footprints import ADVICE_IN_WORDS
 from ..installation import about
-from . import bake, convert, evaluate, inspect, pareto, render, train, view
+from . import bake, convert, evaluate, inspect, pareto, render, report, train, view
 from .arguments import Parser, run_command
 
 __all__ = ["Parser", "build_parser", "main"]
 
-COMMANDS = (train, evaluate, render, view, bake, convert, inspect, pareto)
+COMMANDS = (train, evaluate, render, view, bake, convert, inspect, pareto, report)
 # Commands that are programs of the repository now.
 MOVED = {"tables": "benchmarks/paper_tables.py", "errors": "benchmarks/paper_errors.py"}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .. import io
+from ..analysis.plots import check_plot, evaluation_plots, save_plots
 from ..analysis.tables import format_table
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
@@ -24,7 +25,7 @@ from ..training import (
 from ..training.captures import IMAGES, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES, about_correction, measured_in_words
 from ..training.extent import seen_distance
-from ..training.files import OPTIONS, SCENE, write_json
+from ..training.files import EVALUATION, OPTIONS, SCENE, write_json
 from ..training.parts import check_scales
 from ..training.source import READING
 from ..training.start import background_of
@@ -33,6 +34,7 @@ from .arguments import (
     add_machine_options,
     add_reading,
     add_scales,
+    check_writable_file,
     color,
     count,
     use_expandable_segments,
@@ -71,6 +73,7 @@ def add_parser(subcommands) -> None:
     add("--supersampling", type=count, metavar="N", help=supersampling)
     add("--lpips", choices=(*LPIPS_WEIGHTS, "none"), default="vgg", help="network of LPIPS (default: vgg)")
     add("--pictures", type=int, default=2, metavar="N", help="views to draw per footprint and scale (default: 2)")
+    add("--plot", metavar="FILE", help="draw PSNR by scale and the worst views, as .png, .svg or .pdf")
     add_machine_options(parser)
     add_rank_options(parser)
     parser.set_defaults(run=run)
@@ -78,6 +81,9 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Measures, writes the results, and prints the table."""
+    if args.plot is not None:  # raises before anything is measured
+        check_plot(args.plot)
+        check_writable_file(args.plot)
     use_expandable_segments()
     use_machine(args)
     with ranks_of(args) as ranks:
@@ -157,7 +163,7 @@ def run_on(ranks: Ranks, args) -> None:
         except (ImportError, io.SceneError) as error:
             tell(f"LPIPS is left out: {error}")
     out = writable_folder(args.out or default_out(args.scene, found))
-    pictures_folder = writable_folder(out / "evaluation")
+    pictures_folder = writable_folder(out / EVALUATION)
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
     for footprint in dict.fromkeys(str(choice.footprint) for choice in choices):
@@ -169,7 +175,9 @@ def run_on(ranks: Ranks, args) -> None:
         written = {"scene": str(found.path), "data": str(protocol.source.folder), "views": views}
         written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
-        write_json(out / "evaluation.json", written)
+        write_json(out / f"{EVALUATION}.json", written)
+        if args.plot is not None:
+            save_plots(args.plot, evaluation_plots(results, views))
         print(format_results(results, protocol.scales, options.exposure != "none"))
 
 

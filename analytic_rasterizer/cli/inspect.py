@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shlex
 from dataclasses import asdict
@@ -13,10 +14,12 @@ from .. import io
 from ..analysis.baking import bake_gain
 from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene, steps_of
+from ..analysis.plots import check_plot, save_plots
 from ..io.appearance import holds_scene
 from ..training.captures import IMAGES, is_capture
 from ..training.evidence import MOST_PHOTOGRAPHS
 from ..training.plan import plan_capture
+from ..training.report import plots_of_capture
 from .arguments import (
     LARGER,
     add_footprint,
@@ -33,7 +36,7 @@ from .scenes import say, settle_views
 MOST_VIEWS = 8
 TOLERANCE = 1 / 255
 # Options that captures do not have, and their defaults.
-OF_SCENES = dict.fromkeys(("views", "footprint", "training_views", "size", "background", "picture"))
+OF_SCENES = dict.fromkeys(("views", "footprint", "training_views", "size", "background"))
 OF_SCENES |= {"scales": 1.0, "tolerance": TOLERANCE}
 
 
@@ -61,23 +64,23 @@ def add_parser(subcommands) -> None:
     add("--images", metavar="NAME", help=f"of a capture: folder of the photographs (default: {IMAGES})")
     add("--cameras", metavar="NAME", help="of a capture: file or folder to read the cameras from (default: found)")
     add("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
-    picture = "plot what the views show, as .png, .svg or .pdf: sizes of splats"
-    add("--picture", metavar="FILE", help=picture)
+    plot = "draw what the views show, as .png, .svg or .pdf: sizes of splats; of a capture exposures, sampling, masks"
+    add("--plot", metavar="FILE", help=plot)
+    add("--picture", dest="plot", metavar="FILE", help=argparse.SUPPRESS)  # its former name
     parser.set_defaults(run=run)
 
 
 def run(args) -> None:
     """Inspects the scene, or the capture, and prints the report."""
+    if args.plot:  # raises before anything is looked at
+        check_plot(args.plot)
+        check_writable_file(args.plot)
     if _is_capture(args):
         _inspect_capture(args)
         return
     for name in ("images", "cameras"):
         if getattr(args, name) is not None:
             raise ValueError(f"--{name} is for captures, and {args.scene} is none")
-    if args.picture:  # raises before anything is rendered
-        io.optional_import("matplotlib.figure", "analysis")
-        if Path(args.picture).suffix.lower() not in (".png", ".svg", ".pdf"):
-            raise ValueError(f"--picture must end in .png, .svg or .pdf, got {args.picture}")
     io.optional_import("tqdm")
     use_machine(args)
     found = io.find_scene(args.scene)
@@ -87,9 +90,8 @@ def run(args) -> None:
     limit = min(len(all_views), args.max_views or MOST_VIEWS)
     views = [all_views[i * len(all_views) // limit] for i in range(limit)]
     check_sizes((view.scaled(1 / args.scales) for view in views), args.device, LARGER)
-    for path in (args.json, args.picture):
-        if path not in (None, "-"):
-            check_writable_file(path)
+    if args.json not in (None, "-"):
+        check_writable_file(args.json)
     scene = io.load_scene(found.path).to(args.device)
     say(*said, f"trained with {trained.footprint}: {trained.reason}")
     gain, is_dilated = None, io.is_dilated(trained.footprint)
@@ -104,8 +106,8 @@ def run(args) -> None:
             scene, gain = bake_gain(scene, views, known, trained.footprint, args.background, progress)
         options = {"scale": 1 / args.scales, "background": args.background, "progress": progress}
         report = inspect_scene(scene, views, args.tolerance, training, **options)
-    if args.picture:
-        report.save_picture(args.picture)
+    if args.plot:
+        report.save_picture(args.plot)
     if args.json:
         data = {"trained_with": str(trained.footprint), **report.to_json(), "bake": gain and asdict(gain)}
         text = json.dumps(data, indent=1, allow_nan=False) + "\n"
@@ -138,6 +140,8 @@ def _inspect_capture(args) -> None:
     most = args.max_views or MOST_PHOTOGRAPHS
     plan = plan_capture(args.scene, args.images or IMAGES, cameras=args.cameras, most=most)
     say(*plan.notes)
+    if args.plot:
+        save_plots(args.plot, plots_of_capture(plan))
     if args.json:
         text = json.dumps(plan.to_json(), indent=1, allow_nan=False) + "\n"
         if args.json == "-":

@@ -19,6 +19,7 @@ CHECKPOINT = "checkpoint.pt"
 MIP_SCENE = "point_cloud_mip.ply"
 EXPOSURES = "exposures.json"  # as of 3DGS: 3x4 by the name of a photograph
 METRICS, LOG = "metrics.json", "log.jsonl"
+EVALUATION = "evaluation"  # the folder of pictures, and the name of the .json
 CHECKPOINT_FORMAT = 3
 
 

@@ -105,6 +105,7 @@ class CapturePlan:
         findings: One for each effect.
         notes: What was chosen among what the folder holds, as `Capture.notes`.
         stops: By the paths of the photographs that were read: (3,) of `stops_of_photographs`.
+        survey: What the findings are from, for plots.
     """
 
     capture: str
@@ -113,6 +114,7 @@ class CapturePlan:
     findings: tuple[Finding, ...]
     notes: tuple[str, ...] = ()
     stops: dict[Path, torch.Tensor] = field(default_factory=dict, repr=False, compare=False)
+    survey: Survey | None = field(default=None, repr=False, compare=False)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -145,8 +147,8 @@ class CapturePlan:
         return "\n".join([*lines, f"calls for: {wanted}"])
 
     def to_json(self) -> dict[str, Any]:
-        """Everything but `stops`, as JSON holds it; options in words."""
-        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "stops"}
+        """Everything that can be compared, as JSON holds it; options in words."""
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.compare}
         values["findings"] = [finding.to_json() for finding in self.findings]
         return values | {"options": {name: value_in_words(value) for name, value in self.options.items()}}
 
@@ -188,7 +190,7 @@ def plan_capture(
         _far([item.view for item in found.kept], found.points),
     )
     notes = found.capture.notes
-    return CapturePlan(str(folder), len(found.items), len(found.looked_at), findings, notes, found.stops)
+    return CapturePlan(str(folder), len(found.items), len(found.looked_at), findings, notes, found.stops, found)
 
 
 @single_threaded()

@@ -383,7 +383,7 @@ def test_inspect_prints_json_alone(files, capsys):
         ("--tolerance -1", "argument --tolerance: must be a number that is not negative, got -1"),
         ("--max-views 0", "argument --max-views: must be a positive whole number, got 0"),
         ("--training-views none.json", "none.json: No such file"),
-        ("--picture a.gif", "--picture must end in .png, .svg or .pdf, got a.gif"),
+        ("--plot a.gif", "--plot must end in .png, .svg or .pdf, got a.gif"),
         ("--json views.json/report.json", "views.json: expected a folder for the results, got a file"),
         ("--json .", ".: expected a file for the results, got a folder"),
     ],
@@ -395,7 +395,7 @@ def test_errors_of_inspect_are_one_line(files, capsys, monkeypatch, extra, messa
 
 def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    check_error(inspect_arguments(files, "--picture", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
+    check_error(inspect_arguments(files, "--plot", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
 
 
 def bake_arguments(files, *extra):

@@ -127,7 +127,15 @@ def test_the_messages_are_found():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_advice_that_a_command_cannot_follow_is_left_out(command):
-    given = {"train": "C --out D", "evaluate": "D", "view": "S", "inspect": "S", "pareto": "S", "convert": "S D.ply"}
+    given = {
+        "train": "C --out D",
+        "evaluate": "D",
+        "view": "S",
+        "inspect": "S",
+        "pareto": "S",
+        "convert": "S D.ply",
+        "report": "D",
+    }
     words = f"{command} {given.get(command, 'S --out D')}".split()
     known = getattr(cli.build_parser().parse_args(words), KNOWN_OPTIONS)
     assert known == OPTIONS[command]
