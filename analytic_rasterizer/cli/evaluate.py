@@ -81,10 +81,10 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Measures, writes the results, and prints the table."""
+    use_expandable_segments()
     if args.plot is not None:  # raises before anything is measured
         check_plot(args.plot)
         check_writable_file(args.plot)
-    use_expandable_segments()
     use_machine(args)
     with ranks_of(args) as ranks:
         run_on(ranks, args)

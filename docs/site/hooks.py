@@ -20,6 +20,10 @@ ITEM = re.compile(r"( {0,4})([-*+]|\d+\.) ")
 # Code, in which nothing is a link; or a link, whose text may have code in it.
 LINK = re.compile(r"`[^`]+`|(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)\s]+)\)")
 
+# Figures on white, which a dark page shows inverted.
+PLOTS = ("footprints", "errors", "pareto", "conventions")
+NAMES = re.compile(r"(?<!\[)`([A-Za-z_][\w.]*)`")
+
 log = logging.getLogger("mkdocs.hooks.links")
 
 
@@ -38,7 +42,23 @@ def address_of_files():
 def on_page_markdown(markdown, page, config, files):
     folder, name = os.path.split(page.file.abs_src_path)
     source = pathlib.Path(os.path.realpath(folder), name)
+    if page.file.src_uri == "api/index.md":
+        markdown = with_names(markdown)
     return as_python_markdown(with_links(markdown, source, page.file.src_uri, address_of_files()))
+
+
+def on_page_content(html, page, config, files):
+    """Plots get a class."""
+    plots = rf'<img(?=[^>]*src="[^"]*images/(?:{"|".join(PLOTS)})[^"]*")'
+    return re.sub(plots, '<img class="plot"', html)
+
+
+def with_names(markdown):
+    """Rows of the table of the API with names that are links to where they are described."""
+    return "\n".join(
+        NAMES.sub(r"[`\1`][analytic_rasterizer.\1]", line) if line.startswith("| [") else line
+        for line in markdown.split("\n")
+    )
 
 
 def with_links(markdown, source, page, repository):

@@ -32,6 +32,7 @@ PRINTED_BY = {
         f"training/{name}.py": READERS for name in ("captures", "layouts", "colmap", "photographs", "pictures", "store")
     },
     **{f"training/{name}.py": READERS for name in ("extent", "evidence", "survey")},
+    "training/report.py": (),  # what looks like options is its style sheet
     "training/": ("train",),
     "io/appearance.py": ("evaluate", "render", "view", "bake", "inspect"),
     "io/": tuple(COMMANDS),
@@ -41,7 +42,7 @@ PRINTED_BY = {
 }
 # Texts that not all commands of their module print, by a part of them.
 ONLY = {
-    "--device cuda: no CUDA device": tuple(name for name in COMMANDS if name != "convert"),
+    "--device cuda: no CUDA device": tuple(name for name in COMMANDS if name not in ("convert", "report")),
     "larger numbers in --scales": ("render", "inspect", "pareto"),
     "use --scales, which takes reductions": ("train", "evaluate", "render", "bake", "inspect", "pareto"),
     "{} on the GPU (--picture-memory-gpu)": ("train",),
