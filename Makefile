@@ -78,7 +78,7 @@ test-simple-knn: $(VENV)/.installed
 
 # The viewer in chromium and Firefox, which draw in software. Elsewhere than on Debian as root, CHROMIUM and FIREFOX name
 # the browsers. Tests of a browser that is missing are skipped, with the reason.
-BROWSER_TESTS ?= tests/viewer
+BROWSER_TESTS ?= tests/viewer tests/project/test_docs_browser.py
 BROWSER_PACKAGES := chromium firefox-esr xvfb libgl1-mesa-dri libegl1 libgl1
 test-browser: $(VENV)/.installed
 	$(BIN)/python wheels/install.py --editable ".[test,test-browser]" || echo "no playwright: going on without"
