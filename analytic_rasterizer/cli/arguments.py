@@ -33,6 +33,12 @@ LARGER = "larger numbers in --scales make them smaller"
 ALLOCATOR_VARIABLES = ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF")
 KNOWN_OPTIONS = "known_options"  # of parsed arguments: what messages may advise
 MOST_NAMES = 3  # that may have been meant
+OF_OTHERS = {  # what other trainers call an option
+    **dict.fromkeys(("--steps", "--max-steps", "--max_steps", "--num-iterations"), "--iterations"),
+    **dict.fromkeys(("--model_path", "--model-path", "--result-dir", "--result_dir"), "--out"),
+    **dict.fromkeys(("--resolution", "--data-factor", "--data_factor", "--downscale"), "--scales"),
+    **dict.fromkeys(("--cap-max", "--cap_max", "--num-gaussians"), "--max-gaussians"),
+}
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 """What `--help` shows for a value, by its type."""
 
@@ -80,10 +86,11 @@ class Parser(argparse.ArgumentParser):
         return unknown
 
     def _near_options(self, name: str) -> list[str]:
-        """The options that a name may stand for: those that begin with it, or else the most similar one."""
+        """The options that a name may stand for: what others call by it, those that begin with it, or else the most
+        similar one."""
         actions = [action for action in self._actions if action.help != argparse.SUPPRESS]
         options = [option for action in actions for option in action.option_strings]
-        begun = [option for option in options if option.startswith(name)]
+        begun = [option for option in options if option == OF_OTHERS.get(name) or option.startswith(name)]
         return begun[:MOST_NAMES] or difflib.get_close_matches(name, options, 1)
 
     def _check_value(self, action, value):

@@ -219,6 +219,8 @@ def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
         ("train SCENE --out DIR --iter 3", "arguments: --iter; did you mean --iterations? (see"),
         ("train SCENE --out DIR --iter 3", "(see python -m analytic_rasterizer train --help)"),
         ("train SCENE --picture-memory 1", "; did you mean --picture-memory-gpu or --picture-memory-host? (see"),
+        ("train SCENE --out DIR --steps 3", "arguments: --steps; did you mean --iterations? (see"),
+        ("render a.ply --model_path DIR", "; did you mean --out? (see"),
         ("train SCENE --out DIR --preset quik", "; did you mean quick? (see"),
         ("train SCENE --out DIR --xyzzy", "unrecognized arguments: --xyzzy (see"),
         ("render a.ply -out DIR", "unrecognized arguments: -out; did you mean --out? (see"),
