@@ -53,8 +53,8 @@ def directions(count: int) -> list[tuple[float, float]]:
     return [(AZIMUTH, -ELEVATION), *((i * golden % 360, -math.degrees(math.asin(z))) for i, z in enumerate(rising))]
 
 
-def photograph(count: int, size: int) -> Photographs:
-    """Renders the fly from all sides on white."""
+def photograph(angles: list[tuple[float, float]], size: int, reductions: tuple[int, ...] = REDUCTIONS) -> Photographs:
+    """Renders the fly on white, from azimuth and elevation in degrees."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     mujoco = io.optional_import("mujoco")
     found = importlib.util.find_spec("dm_control")  # of which only the file is read
@@ -79,10 +79,10 @@ def photograph(count: int, size: int) -> Photographs:
     camera.lookat[:] = model.stat.center
     focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     views, pictures = [], []
-    for i, (camera.azimuth, camera.elevation) in enumerate(directions(count)):
+    for i, (camera.azimuth, camera.elevation) in enumerate(angles):
         renderer.update_scene(data, camera)
         samples = torch.from_numpy(renderer.render().copy()).permute(2, 0, 1) / 255
-        pictures.append({n: avg_pool2d(samples, SAMPLES * n) for n in REDUCTIONS})
+        pictures.append({n: avg_pool2d(samples, SAMPLES * n) for n in reductions})
         left, right = renderer.scene.camera
         forward, up = np.array(left.forward, float), np.array(left.up, float)
         axes = np.stack([np.cross(forward, up), -up, forward])  # right, down, forward
@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=60_000, metavar="N", help="at most")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    compare(photograph(args.views, args.size), args.out, args.steps, args.gaussians)
+    compare(photograph(directions(args.views), args.size), args.out, args.steps, args.gaussians)
 
 
 if __name__ == "__main__":
