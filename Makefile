@@ -67,8 +67,16 @@ test-sanitized: $(VENV)/.tools
 	$(CMAKE) --build $(BUILD)/sanitized -j $(JOBS)
 	cd $(BUILD)/sanitized && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
 
-test-python: $(VENV)/.installed
+test-python: $(VENV)/.installed npm
 	$(BIN)/python -m pytest -q $(TESTS)
+
+# What tests compare files with. They skip where npm, or a network, is not.
+NPM := $(BUILD)/npm
+.PHONY: npm
+npm:
+	@[ -e $(NPM)/.installed ] || ! command -v npm > /dev/null || { mkdir -p $(NPM) && \
+	  npm install --silent --no-save --ignore-scripts --prefix $(NPM) @playcanvas/splat-transform@3.7.0 \
+	  gltf-validator@2.0.0-dev.3.10 && touch $(NPM)/.installed; } || echo "nothing from npm: going on without"
 
 # Built in place and not installed, so that a simple_knn that VENV may have stays what it is.
 test-simple-knn: $(VENV)/.installed

@@ -8,7 +8,8 @@ import torch
 
 from .. import io
 from ..gaussians import Gaussians
-from ..io.axes import AXES, axes_of_format
+from ..io.axes import AXES, axes_of_format, axes_written
+from ..io.metadata import axes_said
 from ..io.scenes import WRITTEN_IN_WORDS
 from ..render.effects import MAX_SH_DEGREE
 from .arguments import add_scene_file, box, check_writable_file, fraction
@@ -25,9 +26,10 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("out", metavar="OUT", help=f"the file to write: {WRITTEN_IN_WORDS}")
     three = "three letters for x, y and z: right or left, down or up, forward or back"
-    usual = "rub for .spz, luf for glTF, else rdf"
-    add("--axes", type=str.lower, choices=AXES, metavar="XYZ", help=f"axes of OUT, {three} (default: {usual})")
-    said = f"axes of SCENE (default: those it says, else {usual})"
+    usual = "luf for glTF, rub for OpenUSD"
+    wanted = f"axes of OUT, {three} (default: {usual}, else rdf)"
+    add("--axes", type=str.lower, choices=AXES, metavar="XYZ", help=wanted)
+    said = f"axes of SCENE (default: those it says, else rub for .spz, {usual}, else rdf)"
     add("--scene-axes", type=str.lower, choices=AXES, metavar="XYZ", help=said)
     degrees = range(MAX_SH_DEGREE + 1)
     add("--sh-degree", type=int, choices=degrees, metavar="N", help="leave out harmonics of higher degrees")
@@ -41,6 +43,8 @@ def run(args) -> None:
     """Writes the scene, and says what is in the file."""
     kind = io.written_format(args.out)  # raises
     found = io.find_scene(args.scene)
+    if found.path.suffix.lower() == ".spz" and not (args.scene_axes or axes_said(found.path, "spz")):
+        print(f"{found.path}: says no axes: read as {axes_of_format('spz')}; --scene-axes rdf if SuperSplat wrote it")
     scene = io.load_scene(found.path, axes=args.scene_axes)
     kept = scene.rows(chosen(scene, args.crop, args.min_opacity))
     if not kept.count:
@@ -50,7 +54,7 @@ def run(args) -> None:
     metadata = metadata_of(found)
     check_writable_file(args.out)
     io.save_scene(args.out, kept, metadata, axes=args.axes)
-    axes = args.axes or axes_of_format(kind)
+    axes = args.axes or axes_written(kind)
     footprint = f", footprint {metadata.footprint}" if metadata.footprint else ""
     count = f"{kept.count} of {scene.count} Gaussians" if kept.count < scene.count else f"{scene.count} Gaussians"
     degree = 0 if kind == "splat" else kept.sh_degree

@@ -13,21 +13,33 @@ from itertools import product
 
 import numpy as np
 
+from .turning import Z_UP_TO_Y_UP, placed
+
 OWN_LINE = ["analytic_rasterizer", "axes"]  # the first words of the line that names the axes of a file
 AXES = tuple(map("".join, product("rl", "du", "fb")))
+Z_UP = tuple(map("".join, product("rl", "fb", "du")))  # of files that are read, not of those that are written
 MEMORY = "rdf"
 OF_FORMATS = {"spz": "rub", "gltf": "luf", "glb": "luf", "usd": "rub"}
 """Axes of formats that are not RDF, as other programs write and read them.
 
-An .spz is RUB by its documents. Those of glTF say y-up, and that models face +z. Scenes are turned to LUF by
-splat-transform (PlayCanvas), by the documents of .spz, and by the extension that stores an .spz in a glTF (Cesium).
-Viewers (Babylon, PlayCanvas, three.js, Cesium) place them as any glTF. A USD is y-up, and its cameras look along -z.
+An .spz is RUB by its documents, where it does not say its axes: Scaniverse and LichtFeld write it so. The documents of
+glTF say y-up, and that models face +z. Scenes are turned to LUF by splat-transform (PlayCanvas), by the documents of
+.spz, and by the extension that stores an .spz in a glTF (Cesium). Viewers (Babylon, PlayCanvas, three.js, Cesium)
+place them as any glTF. A USD is y-up, and its cameras look along -z.
 """
+WRITTEN = OF_FORMATS | {"spz": MEMORY}
+"""Axes that this package writes. An .spz says its axes; SuperSplat, splat-transform from 3 on, and Spark do not look,
+and take its numbers as those of a .ply."""
 
 
 def axes_of_format(kind: str) -> str:
     """The axes of a format's files that do not say theirs."""
     return OF_FORMATS.get(kind, MEMORY)
+
+
+def axes_written(kind: str) -> str:
+    """The axes of files that this package writes, where the user asks for none."""
+    return WRITTEN.get(kind, MEMORY)
 
 
 def checked_axes(axes: str) -> str:
@@ -53,10 +65,12 @@ def flipped(fields: dict[str, np.ndarray], axes: str) -> dict[str, np.ndarray]:
 
     Args:
         fields: Parameters by the names of the fields of `Gaussians`. Harmonics may have any degree.
-        axes: One of AXES.
+        axes: One of AXES; of a file also one of Z_UP, whose Gaussians are turned.
     """
     if axes == MEMORY:
         return fields
+    if axes[1] in "fb":
+        fields, axes = placed(fields, Z_UP_TO_Y_UP), axes[0] + axes[2] + "bf"["fb".index(axes[1])]
     signs = np.array([1 if letter == own else -1 for letter, own in zip(axes, MEMORY)], np.float32)
     # A rotation R becomes S R S. Its axis turns with S, and where S is a mirror the angle changes its sign.
     quaternion = np.array([1, *(signs * signs.prod())], np.float32)

@@ -130,7 +130,7 @@ def read_metadata(path) -> SceneMetadata:
             `load_scene` reads.
     """
     path, kind = scene_file(path)
-    antialiased, lines = _read_lines(path, kind)
+    antialiased, lines, _ = _read_lines(path, kind)
     found = metadata_of(lines, path)
     return found if antialiased is None else replace(found, antialiased=antialiased)
 
@@ -139,26 +139,32 @@ def read_axes(path) -> str:
     """The axes of the numbers in the file `path` of a scene, such as "rub": what it says, or those of its format.
 
     `load_scene` turns them to RDF. Of a .ply, .splat or .sog that says nothing they are RDF, of an .spz or USD RUB, and
-    of a glTF LUF. Before axes were written, this package wrote RDF into an .spz and RUB into a glTF. Such files are
-    known by our lines in them, but for an .spz without metadata.
+    of a glTF LUF. An .spz may also be z-up, such as "rfu". Before axes were written, this package wrote RDF into an
+    .spz and RUB into a glTF. Such files are known by our lines in them, but for an .spz without metadata.
 
     Raises:
         SceneError: As `read_metadata`.
     """
     path, kind = scene_file(path)
-    return axes_in(_read_lines(path, kind)[1]) or axes_of_format(kind)
+    return axes_said(path, kind) or axes_of_format(kind)
 
 
-def _read_lines(path: Path, kind: str) -> tuple[bool | None, Sequence[str]]:
-    """What a file says of antialiasing by its own means, and its lines of text."""
+def axes_said(path: Path, kind: str) -> str | None:
+    """The axes that a file of a scene says, of a format of FORMATS; None where it says none. Raises as `read_axes`."""
+    _, lines, axes = _read_lines(path, kind)
+    return axes or axes_in(lines)
+
+
+def _read_lines(path: Path, kind: str) -> tuple[bool | None, Sequence[str], str | None]:
+    """What a file says of antialiasing by its own means, its lines of text, and axes that it says by its own means."""
     if kind == "spz":
         return spz.read_metadata(path)
     if kind == "sog":
-        return sog.read_metadata(path)
+        return *sog.read_metadata(path), None
     if kind == "gltf":
-        return None, gltf.read_lines(path)
+        return None, gltf.read_lines(path), None
     if kind == "usd":
-        return None, usd.read_lines(path)
+        return None, usd.read_lines(path), None
     if kind == "splat":
-        return None, []
-    return None, ply.read_header(path).comments
+        return None, [], None
+    return None, ply.read_header(path).comments, None

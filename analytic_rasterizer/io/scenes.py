@@ -11,7 +11,7 @@ import torch
 
 from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
 from . import gltf, ply, sog, splat, spz, usd
-from .axes import axes_of_format, checked_axes, flipped, with_axes
+from .axes import axes_of_format, axes_written, checked_axes, flipped, with_axes
 from .compressed import is_compressed, read_compressed, to_compressed
 from .errors import SceneError, first_line, naming
 from .formats import SOG_META, scene_file, suffix_of
@@ -219,7 +219,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
         raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:
         metadata = (metadata or SceneMetadata()).checked()
-        axes = axes_of_format(kind) if axes is None else checked_axes(axes)
+        axes = axes_written(kind) if axes is None else checked_axes(axes)
     except (ValueError, TypeError) as error:
         raise SceneError(f"{path}: {first_line(error)}") from None
     scene = scene.map(lambda field: field.detach().to("cpu", torch.float32))
@@ -246,7 +246,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
     elif kind == "spz":
         with naming(path):
             spz.fractional_bits(fields["means"])  # raises
-        write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
+        write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines, axes))
     elif kind == "usd":
         usd.pxr("UsdVol")  # raises
         write_safely(path, lambda temporary: usd.write_usd(temporary, fields, lines))
@@ -261,8 +261,9 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
 def _lines(kind: str, metadata: SceneMetadata, axes: str) -> list[str]:
     """The text of a file, with its axes where they are in doubt: in a format that this package wrote with others."""
     lines = (replace(metadata, antialiased=None) if kind in ("spz", "sog") else metadata).lines()  # which have a flag
-    in_doubt = kind in ("glb", "gltf") or (kind == "spz" and lines)
-    return with_axes(lines, axes) if in_doubt or axes != axes_of_format(kind) else lines
+    if kind == "spz":  # which says them by its own means
+        return lines
+    return with_axes(lines, axes) if kind in ("glb", "gltf") or axes != axes_of_format(kind) else lines
 
 
 def _check(scene: Gaussians, kind: str) -> None:

@@ -1,7 +1,8 @@
 """The .spz format (Niantic): compressed Gaussians, a flag for antialiasing, and extensions.
 
-gsply reads and writes the Gaussians. What it leaves out is here: the flag, and an extension of ours that holds lines of
-text. An extension is a record of type, length and content, which programs that do not know the type skip. Versions 1 to
+gsply reads and writes the Gaussians. What it leaves out is here: the flag, and two extensions, Adobe's that says the
+axes, and ours that holds lines of text. An extension is a record of type, length and content, which programs that do
+not know the type skip. Versions 1 to
 3 are compressed by gzip as a whole and have extensions at the end; from version 4 on, the header and the extensions are
 in front of the compressed parts.
 """
@@ -27,6 +28,11 @@ SEPARATE_PARTS = 4  # the version from which on every part is compressed by itse
 REST_OF_HEADER = struct.Struct("<I12x")  # of these versions
 ANTIALIASED, HAS_EXTENSIONS = 1, 2  # bits of the flags
 OWN_EXTENSION = 0x4152_0001  # vendor "AR", its first: lines of UTF-8, those of a .ply's comments
+AXES_EXTENSION = 0xADBE_0003  # SPZ_ADOBE_coordinate_system: a place in AXES, counted from 1
+# As CoordinateSystem in src/cc/splat-types.h of github.com/nianticlabs/spz has them.
+AXES = tuple(x + y + z for z in "bf" for y in "du" for x in "lr") + tuple(
+    x + y + z for y in "fb" for z in "du" for x in "lr"
+)
 MOST_TEXT = 1 << 20  # bytes of extensions that are looked at
 
 
@@ -59,26 +65,27 @@ def read_spz(path: Path) -> dict[str, np.ndarray]:
         return fields_of(read(path))
 
 
-def write_spz(temporary: Path, fields: dict[str, np.ndarray], antialiased: bool, lines: Sequence[str]) -> None:
+def write_spz(
+    temporary: Path, fields: dict[str, np.ndarray], antialiased: bool, lines: Sequence[str], axes: str
+) -> None:
     """Writes an .spz of version 3.
 
     Args:
         temporary: The file, see `write_safely`.
         fields: As from `read_spz`, float32, with unit quaternions.
         antialiased: The flag.
-        lines: Text for the extension; none leaves it out.
+        lines: Text for our extension; none leaves it out.
+        axes: Those of the fields, for Adobe's.
 
     Raises SceneError for means that the format does not hold, OSError, and ImportError without gsply.
     """
     gsply().write_spz(temporary, data_of(fields), version=3, fractional_bits=fractional_bits(fields["means"]))
-    text = "\n".join(lines).encode()
-    if not antialiased and not text:
-        return
     content = bytearray(gzip.decompress(temporary.read_bytes()))
     header = Header._make(HEADER.unpack_from(content))
-    flags = header.flags | (ANTIALIASED if antialiased else 0) | (HAS_EXTENSIONS if text else 0)
+    flags = header.flags | (ANTIALIASED if antialiased else 0) | HAS_EXTENSIONS
     HEADER.pack_into(content, 0, *header._replace(flags=flags))
-    if text:
+    content += struct.pack("<III", AXES_EXTENSION, 4, AXES.index(axes) + 1)
+    if text := "\n".join(lines).encode():
         content += struct.pack("<II", OWN_EXTENSION, len(text)) + text
     temporary.write_bytes(gzip.compress(content, 6, mtime=0))
 
@@ -95,8 +102,11 @@ def fractional_bits(means: np.ndarray) -> int:
     return min(bits, 12)
 
 
-def read_metadata(path: Path) -> tuple[bool, list[str]]:
-    """Whether the flag for antialiasing is set, and the lines of our extension. Raises SceneError, naming the file."""
+def read_metadata(path: Path) -> tuple[bool, list[str], str | None]:
+    """Whether the flag for antialiasing is set, the lines of our extension, and the axes that Adobe's says.
+
+    Raises SceneError, naming the file.
+    """
     with naming(path), unreadable(), path.open("rb") as raw:
         compressed = raw.read(len(MAGIC)) != MAGIC
         raw.seek(0)
@@ -113,14 +123,21 @@ def read_metadata(path: Path) -> tuple[bool, list[str]]:
         elif header.flags & HAS_EXTENSIONS:
             file.seek(HEADER.size + header.payload())
             records = file.read(MOST_TEXT)
-        return bool(header.flags & ANTIALIASED), _own_lines(records)
+        found = _by_type(records)
+        lines = found.get(OWN_EXTENSION, b"").decode("utf-8", "replace").splitlines()
+        code = int.from_bytes(found.get(AXES_EXTENSION, b"")[:4], "little")
+        if 0 < code <= len(AXES):
+            return bool(header.flags & ANTIALIASED), lines, AXES[code - 1]
+        # Files of earlier versions have the axes of memory, or say others in a line.
+        lines = with_axes(lines, MEMORY) if OWN_EXTENSION in found else lines
+        return bool(header.flags & ANTIALIASED), lines, None
 
 
-def _own_lines(records: bytes) -> list[str]:
-    """The text of our extension, if it is one of these records; files of earlier versions have the axes of memory."""
+def _by_type(records: bytes) -> dict[int, bytes]:
+    """The contents of extensions; of several of one type the first."""
+    found: dict[int, bytes] = {}
     while len(records) >= 8:
         kind, length = struct.unpack_from("<II", records)
-        if kind == OWN_EXTENSION:
-            return with_axes(records[8 : 8 + length].decode("utf-8", "replace").splitlines(), MEMORY)
+        found.setdefault(kind, records[8 : 8 + length])
         records = records[8 + length :]
-    return []
+    return found

@@ -9,6 +9,7 @@ from ..cameras.rotations import quaternion, rotation_matrices
 from .errors import SceneError
 
 TOLERANCE = 1e-4  # relative, of a node's matrix from a rotation with one scale
+Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 SAMPLES = 64  # directions, more than the 16 harmonics
 
 

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from .errors import SceneError, naming, optional_import, unreadable
-from .turning import joined, placed
+from .turning import Z_UP_TO_Y_UP, joined, placed
 
 PRIM = "ParticleField3DGaussianSplat"
 OWN = "analytic_rasterizer"  # the key of customLayerData that holds lines, those of a .ply's comments
 LARGEST_DEGREE = 3
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # from z-up to y-up
 HARMONICS = "radiance:sphericalHarmonics"
 
 
@@ -38,7 +37,7 @@ def read_usd(path: Path) -> dict[str, np.ndarray]:
     usd, geometry = pxr("Usd"), pxr("UsdGeom")
     with naming(path), unreadable():
         stage = usd.Stage.Open(str(path))
-        up = Z_UP if geometry.GetStageUpAxis(stage) == "Z" else np.eye(4)
+        up = Z_UP_TO_Y_UP if geometry.GetStageUpAxis(stage) == "Z" else np.eye(4)
         cache = geometry.XformCache()
         # USD multiplies rows by matrices from the right.
         parts = [

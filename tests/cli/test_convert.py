@@ -1,6 +1,8 @@
 """`convert`: any format to any, turned, cut and thinned out, with what the scene says of itself."""
 
+import gzip
 import json
+import struct
 
 import pytest
 import torch
@@ -29,8 +31,24 @@ def test_any_format_to_any(tmp_path, capsys):
     assert (found.shs - scene.shs).abs().max() < 0.06
     out = capsys.readouterr().out.splitlines()
     assert (
-        out[2] == f"{tmp_path / 'circle/a.spz'}: 40 Gaussians, harmonics of degree 0, axes rub, footprint box:samples=4"
+        out[2] == f"{tmp_path / 'circle/a.spz'}: 40 Gaussians, harmonics of degree 0, axes rdf, footprint box:samples=4"
     )
+
+
+@pytest.mark.parametrize("options, said", [("--sh-degree 0", 1), ("--scene-axes rdf", 0)])
+def test_an_spz_that_says_no_axes(tmp_path, capsys, options, said):
+    """Its format's documents say one thing, and SuperSplat does another."""
+    scene, path = random_gaussians(degree=1), tmp_path / "a.spz"
+    io.save_scene(path, scene)
+    assert command("convert", path, tmp_path / "b.ply") == 0
+    assert "says no axes" not in capsys.readouterr().out
+    content = gzip.decompress(path.read_bytes())
+    path.write_bytes(gzip.compress(content.replace(struct.pack("<III", 0xADBE0003, 4, 6), b"")))
+    assert command("convert", path, tmp_path / "c.ply", options) == 0
+    line = f"{path}: says no axes: read as rub; --scene-axes rdf if SuperSplat wrote it"
+    assert capsys.readouterr().out.count(line) == said
+    found = [io.load_scene(tmp_path / name).means[:, 1] for name in ("b.ply", "c.ply")]
+    assert torch.equal(found[0], -found[1] if said else found[1])
 
 
 @pytest.mark.parametrize("name", NAMES)

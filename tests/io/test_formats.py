@@ -515,12 +515,12 @@ def test_a_default_footprint_is_written_with_its_options(tmp_path):
 
 
 def test_other_programs_read_an_spz_with_an_extension(tmp_path):
-    """The Gaussians come first, as in a file without one; then a record that says its length."""
+    """The Gaussians come first, as in a file without one; then records that say their length."""
     scene = random_gaussians(degree=1)
     for name, metadata in (("a.spz", None), ("b.spz", io.SceneMetadata(footprint="moment"))):
         io.save_scene(tmp_path / name, scene, metadata)
     plain, tagged = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("a.spz", "b.spz"))
-    assert (plain[14], tagged[14]) == (0, 3)
+    assert (plain[14], tagged[14]) == (2, 3)
     assert plain[:14] + plain[15:] == (tagged[:14] + tagged[15:])[: len(plain) - 1]
     kind, length = struct.unpack("<II", tagged[len(plain) : len(plain) + 8])
     assert kind >> 16 and len(tagged) == len(plain) + 8 + length

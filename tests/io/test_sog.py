@@ -2,8 +2,6 @@
 
 import json
 import math
-import shutil
-import subprocess
 import zipfile
 from io import BytesIO
 
@@ -139,22 +137,3 @@ def test_palettes():
     assert np.square(found[labels] - wide).mean() < 0.35  # of 1; four rows share an entry
     same, labels = palette(wide[:100], 1024)
     assert np.array_equal(same[labels], wide[:100])
-
-
-def test_splat_transform_reads_the_same(tmp_path):
-    program = shutil.which("splat-transform")
-    if program is None:
-        pytest.skip("needs splat-transform (npm install --global @playcanvas/splat-transform)")
-    io.save_scene(tmp_path / "a.sog", random_gaussians(300))
-    (tmp_path / "folder").mkdir()
-    io.save_scene(tmp_path / "folder" / "meta.json", random_gaussians(300))
-    wanted = io.load_scene(tmp_path / "a.sog")
-    for source in ("a.sog", "folder/meta.json"):
-        command = [program, "--quiet", "--overwrite", tmp_path / source, tmp_path / "back.ply"]
-        subprocess.run(command, check=True, capture_output=True)
-        found = io.load_scene(tmp_path / "back.ply")
-        torch.testing.assert_close(found.means, wanted.means, rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(found.log_scales, wanted.log_scales, rtol=0, atol=1e-6)
-        torch.testing.assert_close(found.shs, wanted.shs, rtol=0, atol=1e-6)
-        torch.testing.assert_close(found.opacities, wanted.opacities, rtol=0, atol=0.5 / 255)
-        assert (found.rotations * wanted.rotations).sum(1).abs().min() > 1 - 1e-6
