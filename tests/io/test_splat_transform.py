@@ -4,14 +4,13 @@ No number is further off than half a step of the format, in the same axes, for e
 """
 
 import math
-import subprocess
 
 import numpy as np
 import pytest
 import torch
 from cli_extra import image  # noqa: F401  (skips without the extra)
 from gaussians import random_gaussians
-from npm import program
+from npm import splat_transform
 from test_axes import covariance, glb_parts
 from test_formats import ROUNDED, smallest_three, steps_of
 
@@ -24,16 +23,7 @@ COUNT = 512
 
 @pytest.fixture(scope="module")
 def convert():
-    """Lets splat-transform make a file of another."""
-    found = program("splat-transform")
-
-    def run(source, target, *options):
-        command = [found, "--quiet", "--overwrite", "--gpu", "cpu", *options, source, target]
-        done = subprocess.run(command, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        return target
-
-    return run
+    return splat_transform()
 
 
 def in_order_of(scene, found):

@@ -79,6 +79,11 @@ def assert_same(ours, expected, largest=LARGEST, rms=ROOT_MEAN_SQUARE):
     assert np.sqrt(np.mean(error**2)) <= rms
 
 
+def psnr(ours, expected):
+    """Of colours from 0 to 1 [dB]."""
+    return -10 * np.log10(np.mean((ours.clip(0, 1) - expected.clip(0, 1)) ** 2))
+
+
 def turned_view(width=160, height=120, focal=150.0, **options):
     angle = torch.tensor(0.2, dtype=torch.float64)
     w2c = torch.eye(4, dtype=torch.float64)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from gaussians import make_view, of_inputs, random_gaussians
 from node import run_node
-from pages import gaussians_of, random_scene, rendered, turned_view
+from pages import gaussians_of, psnr, random_scene, rendered, turned_view
 
 import demo
 from analytic_rasterizer import io, viewer
@@ -86,10 +86,6 @@ def test_numbers_of_any_size_survive(degree):
     finest = 2.0**-44 * 2 * given.means.abs().max()
     bound = 2 ** (1 / 64) * (middle / 128).clamp_min(finest) + HALF_ULP * given.means.abs()
     assert ((back.means - given.means).abs() <= bound).all()
-
-
-def psnr(ours, expected):
-    return -10 * np.log10(np.mean((ours.clip(0, 1) - expected.clip(0, 1)) ** 2))
 
 
 def assert_near(given, views, footprint, background=(0.0, 0.0, 0.0)):
