@@ -1,7 +1,7 @@
 """What the photographs of a capture show of the same points: colours, sharpness, and sampling intervals.
 
 Photographs are compared at the points that they share. What is measured of a point in a photograph is the sum of what
-the point has and of what the photograph adds; medians over points and over photographs in turn separate the two.
+the point has and of what the photograph adds; `offsets_of` separates the two.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch.nn import functional
 
 from .. import io
 from .layouts import Photograph
+from .offsets import offsets_of
 from .photographs import broken_files, read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
@@ -27,7 +28,6 @@ READERS = 8  # threads, each of which holds a whole picture for a moment
 LEAST_SEEN = 3  # photographs that see a point: of two nobody knows which is the odd one
 LEAST_COMMON = 20  # points that a photograph shares with others: its median is then right to a third of their spread
 LEAST_AROUND = 40  # photographs of an object, whose nine numbers of what is usual are then known
-ROUNDS = 5  # of medians in turn; where photographs overlap, the first three do nearly all
 
 # A point is visible where it is about as near as the nearest point in a cell.
 CELL = 8  # px
@@ -260,14 +260,13 @@ def stops_of(evidence: Evidence) -> Tensor:
     for strictness in (0.5, 1, None):  # the first offsets are those with hidden and shining points
         kept = _shared(photograph, point, evidence)
         logs, photograph, point = logs[kept], photograph[kept], point[kept]
-        fits = [offsets_of(channel, photograph, point, evidence) for channel in logs.unbind(1)]
-        offsets, levels = (torch.stack(values, 1) for values in zip(*fits))
+        fit = offsets_of(logs, photograph, point, evidence.count)
         if strictness is not None:
-            deviations = strictness * (logs - offsets[photograph] - levels[point]).abs().amax(1)
+            deviations = strictness * fit.deviations.abs().amax(1)
             kept = medians_of(deviations, point, evidence.points)[point] < CONSISTENT
             kept &= deviations < OUTLYING
             logs, photograph, point = logs[kept], photograph[kept], point[kept]
-    return offsets
+    return fit.offsets
 
 
 def object_stops(evidence: Evidence, axes: Tensor) -> Tensor:
@@ -296,7 +295,7 @@ def sharpness_of(evidence: Evidence) -> Tensor:
     finest, next_finest = evidence.bands[textured].unbind(1)
     shares = 0.5 * (finest / next_finest).clamp_min(1e-6).log2()
     kept = _shared(photograph, point, evidence)
-    return offsets_of(shares[kept], photograph[kept], point[kept], evidence)[0]
+    return offsets_of(shares[kept, None], photograph[kept], point[kept], evidence.count).offsets[:, 0]
 
 
 def interval_ranges(evidence: Evidence) -> Tensor:
@@ -313,17 +312,6 @@ def _shared(photograph: Tensor, point: Tensor, evidence: Evidence) -> Tensor:
         common = torch.bincount(photograph[kept], minlength=evidence.count)
         kept = kept & (common[photograph] >= LEAST_COMMON)
     return kept
-
-
-def offsets_of(values: Tensor, photograph: Tensor, point: Tensor, evidence: Evidence) -> tuple[Tensor, Tensor]:
-    """What photographs add to values (O,), and what points have: (count,) with the median 0, and (points,); NaN where
-    nothing is known."""
-    offsets = values.new_zeros(evidence.count)
-    for _ in range(ROUNDS):
-        levels = medians_of(values - offsets[photograph], point, evidence.points)
-        offsets = medians_of(values - levels[point], photograph, evidence.count)
-        offsets = offsets - offsets.nanmedian()
-    return offsets, levels
 
 
 def medians_of(values: Tensor, group: Tensor, count: int) -> Tensor:

@@ -50,8 +50,8 @@ def light_of(view) -> np.ndarray:
     return texture(*hit[:, :2].T.numpy()).reshape(shape).mean((1, 3))
 
 
-def cameras(distance=lambda i: 4.0, lens=None) -> list:
-    angles = [0.08 * (i - COUNT / 2) for i in range(COUNT)]
+def cameras(distance=lambda i: 4.0, lens=None, count=COUNT) -> list:
+    angles = [0.08 * COUNT / count * (i - count / 2) for i in range(count)]
     poses = [looking_at_origin(angle, distance(i)) for i, angle in enumerate(angles)]
     return [io.View(f"p_{i}", *SIZE, 180.0, 180.0, pose, lens=lens) for i, pose in enumerate(poses)]
 
