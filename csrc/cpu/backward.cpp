@@ -1,14 +1,11 @@
-// The backward pass of the CPU, stage by stage in the order of Backend (torch/backend.h), and the loops that each stage
-// runs. torch/backend_cpu.cpp allocates, fills the parameters of stages.h, and calls these functions. forward.cpp has
-// the forward pass.
+// The backward pass of the CPU, stage by stage in the order of Backend (torch/backend.h), called as forward.cpp is, and
+// the loops that each stage runs:
 //
-// | stage        | from, to                                                 | loops             |
-// |--------------|----------------------------------------------------------|-------------------|
-// | blend_vjp    | gradients of images to a row for each pair               | blend_vjp.h       |
-// | sum_channels | rows of pairs to gradients of channels                   | sum_channels.h    |
-// | project_vjp  | rows of pairs, or gradients of public rows, to gradients | project.h, rows.h |
-// |              | of Gaussians and cameras                                 |                   |
-// | row_grads    | rows of pairs to gradients of public rows                | rows.h            |
+//   blend_vjp      gradients of images to a row for each pair                 blend_vjp.h
+//   sum_channels   rows of pairs to gradients of channels                     sum_channels.h
+//   project_vjp    rows of pairs, or gradients of public rows, to gradients   project.h, rows.h
+//                  of Gaussians and cameras
+//   row_grads      rows of pairs to gradients of public rows                  rows.h
 #include "cpu/stages.h"
 
 namespace ar::cpu {

@@ -66,8 +66,8 @@ const Stages<float>& avx512_stages(int footprint) {
 }
 #endif
 
-/// The best supported set, or that of the environment. An unsupported request changes nothing: a variable from another
-/// machine must break no program.
+/// The best supported set, or that of the environment if supported: a variable from another machine must break no
+/// program.
 const InstructionSet& choose() {
   const char* wanted = std::getenv("ANALYTIC_RASTERIZER_ISA");
   for (const InstructionSet& set : instruction_sets()) {

@@ -1,6 +1,5 @@
 // Included by the loops of cpu/ in every kernels_*.cpp, which compiles them for one instruction set. That file defines
-// AR_ISA, the namespace of this set, so that the linker does not merge its code with that of other sets, and AR_LANES,
-// the floats of a register.
+// AR_ISA, the namespace of this set, so that the linker keeps sets apart, and AR_LANES, the floats of a register.
 #pragma once
 
 #if !defined(AR_ISA) || !defined(AR_LANES)

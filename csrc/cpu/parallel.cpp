@@ -30,8 +30,8 @@ void run_alone(int64_t items, RunItem run, const void* body) {
 std::atomic<bool> is_forked{false};
 [[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
 
-/// By loop of the program: a short one may wait for threads that come in time for a long one. Never freed, for threads
-/// that outlive main().
+/// By loop of the program: a short one may wait for threads that are in time for a long one. Never freed: threads may
+/// outlive main().
 struct Teams {
   std::mutex mutex;
   std::unordered_map<RunItem, TeamSize> sizes;

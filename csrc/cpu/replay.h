@@ -1,5 +1,5 @@
 // Samples that move. TilePlaces is their state in a tile. Replay composites a tile again for blend_vjp.h and logs
-// alphas and positions, since earlier positions do not follow from later ones.
+// alphas and positions: earlier ones do not follow from later ones.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// ssim and ssim_vjp of training.h, in blocks of pixels. Window sums go along rows, then along columns. Sums of blocks
-// are added in order, so that threads change no bit.
+// ssim and ssim_vjp of training.h, in blocks of pixels. Window sums go along rows, then columns. Sums of blocks are
+// added in order: threads change no bit.
 #include "core/ssim.h"
 
 #include <algorithm>

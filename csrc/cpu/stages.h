@@ -1,5 +1,5 @@
 // Parameters of the CPU's stages beyond core/stages.h, and Stages, the table of functions that run them.
-// backend_cpu.cpp sets the parameters and owns all memory. forward.cpp and backward.cpp run what is in the table.
+// backend_cpu.cpp sets the parameters and owns all memory; forward.cpp and backward.cpp run the table.
 #pragma once
 
 #include <cstdint>

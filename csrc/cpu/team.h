@@ -1,6 +1,6 @@
 // How many threads a loop gets: a rule without a clock or threads of its own. A loop of OpenMP ends when all threads of
-// its team have come, and where other programs use the cores the last one may come after all work is done. parallel.cpp
-// asks before a loop and tells afterwards how late its threads were.
+// its team have come; beside other programs the last may come after all work is done. parallel.cpp asks before a loop
+// and then tells how late its threads were.
 #pragma once
 
 #include <algorithm>
@@ -8,8 +8,8 @@
 
 namespace ar::cpu {
 
-/// Halves the team when loops lose more by waiting for late threads than they gain. Tries twice as many again and
-/// again; all trials together cost a small part of the time. Times are in seconds.
+/// Halves the team when loops lose more by waiting for late threads than they gain. Now and then tries twice as many;
+/// all trials cost a small part of the time. Times are in seconds.
 class TeamSize {
  public:
   /// For the next loop, from 1 to `threads`.

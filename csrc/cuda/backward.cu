@@ -11,8 +11,8 @@
 namespace ar::cuda {
 namespace {
 
-/// All kernels on a multiprocessor share one division of its memory into cache and shared memory: blend_vjp, with much
-/// shared memory, cannot begin beside a kernel with much cache. Once per device, as every call takes memory.
+/// Kernels on a multiprocessor share one division of its memory into cache and shared memory: blend_vjp, with much of
+/// the latter, cannot begin beside a kernel with much cache. Once per device: every call takes memory.
 void let_blend_vjp_begin_beside_zero_culled_grads() {
   static std::mutex mutex;
   static std::set<int> devices;

@@ -1,19 +1,19 @@
 // Which family of kernels blends a footprint, in which tiles. forward.cu and backward.cu ask for the family, csrc/torch
 // for sizes of memory. A test compares the names in Route with the kernels that are launched.
 //
-// | footprint                          | channels | tiles                          | family    |
-// |------------------------------------|----------|--------------------------------|-----------|
-// | point, mip, box 1, cumulant,       | up to 4  | 16x16, a lane per pixel        | still/    |
-// |   analytic                         |          |                                |           |
-// | box 4, kSpreadImageTiles or more   | up to 4  | 16x16, four samples in a lane  | still/    |
-// | box 4, fewer tiles                 | up to 4  | 8x8, a lane per sample         | still/    |
-// | box 16                             | up to 4  | 4x4, a lane per sample         | still/    |
-// | all of these                       | more     | the same                       | channels/ |
-// | kGeneric: erf, exact, and          | any      | 16x16, a lane per pixel        | channels/ |
-// |   analytic, frame_gradient "paper" |          |                                |           |
-// | moment 1                           | any      | 16x16; 8x8 in small images     | moment/   |
-// | moment 4                           | any      | 8x8                            | moment/   |
-// | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |
+//   footprint                            channels   tiles                           family
+//
+//   point, mip, box 1, cumulant,         up to 4    16x16, a lane per pixel         still/
+//     analytic
+//   box 4, kSpreadImageTiles or more     up to 4    16x16, four samples in a lane   still/
+//   box 4, fewer tiles                   up to 4    8x8, a lane per sample          still/
+//   box 16                               up to 4    4x4, a lane per sample          still/
+//   all of these                         more       the same                        channels/
+//   kGeneric: erf, exact, and            any        16x16, a lane per pixel         channels/
+//     analytic, frame_gradient "paper"
+//   moment 1                             any        16x16; 8x8 in small images      moment/
+//   moment 4                             any        8x8                             moment/
+//   moment 16                            any        8x8; 4x4 in small images        moment/
 #pragma once
 
 #include <algorithm>

@@ -1,9 +1,9 @@
 // How the host launches every kernel, how every kernel begins, and what the host asks a device.
 //
 // A kernel may be on the device before earlier kernels of its stream have ended (programmatic dependent launch). So
-// every thread first calls wait_for_earlier_kernels(). The exception is a kernel B that runs beside the kernel A before
-// it: A calls let_next_kernel_begin(), and B begin_beside_earlier_kernels(). B reads what was written before a kernel
-// that waits first and then lets the next begin.
+// every thread first calls wait_for_earlier_kernels(). Except in a kernel B that runs beside the kernel A before it: A
+// calls let_next_kernel_begin(), B begin_beside_earlier_kernels(). B reads what was written before a kernel that waits
+// first and then lets the next begin.
 #pragma once
 
 #include <cuda_runtime.h>

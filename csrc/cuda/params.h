@@ -1,5 +1,5 @@
-// Parameter structs of the CUDA stages, and the functions that launch them. A struct adds to its namesake in
-// core/stages.h what only CUDA needs. Pointers are device memory of the caller. No function waits for the device.
+// Parameter structs of the CUDA stages, and functions that launch them. A struct adds to its namesake in core/stages.h
+// what CUDA needs. Pointers are device memory of the caller. No function waits for the device.
 //
 // Only the device knows the number of pairs. The caller gives room for `capacity` pairs, at least one per splat. If
 // there are more, neighbouring tiles (a patch) share a list, and blending tests its splats against each tile: slower,

@@ -1,6 +1,6 @@
-// The autograd node of all differentiable ops. In C++, because a node from Python takes longer than the launches of a
-// small scene. The node of `name` calls `name_vjp` with VjpArguments. Differentiable outputs come first: up to the
-// first of integers, or to the last list, `saved`. Adjoints have no derivative.
+// The autograd node of all differentiable ops. In C++: a node from Python takes longer than the launches of a small
+// scene. That of `name` calls `name_vjp` with VjpArguments. Differentiable outputs come first: up to the first of
+// integers, or to the last list, `saved`. Adjoints have no derivative.
 #include <torch/csrc/autograd/autograd_not_implemented_fallback.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>

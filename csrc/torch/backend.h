@@ -1,5 +1,5 @@
-// Backend: a function per stage, and the tensors between stages. The ops allocate what all devices share, and call it.
-// backend_cpu.cpp and backend_cuda.cpp allocate everything else and run the stages (core/stages.h).
+// Backend: a function per stage, and the tensors between stages. The ops allocate what all devices share;
+// backend_cpu.cpp and backend_cuda.cpp allocate the rest and run the stages (core/stages.h).
 #pragma once
 
 #include <ATen/Context.h>

@@ -196,7 +196,7 @@ class CudaBackend final : public Backend {
     if (p.gaussians.n == 0) return;
     side_.emplace(stream_);
     // Blocks of blend_vjp must start later: they stay until no work is left. In a captured graph only a kernel can wait
-    // for that, and the next node may be none.
+    // for that; the next node may be none.
     const bool ordered = !is_capturing(stream_);
     cuda::zero_culled_grads(p, side_->stream(), ordered ? side_->begun() : nullptr);
     if (ordered) side_->wait_until_begun();

@@ -1,5 +1,5 @@
 // The checks of checks.h for rendering with one camera: shapes, types and values of arguments, lists and saved tensors.
-// find_footprint() and grid_of() are here too, because they check a footprint's name and a picture's size.
+// And of a footprint's name (find_footprint()) and a picture's size (grid_of()).
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>

@@ -27,16 +27,16 @@ enum class Counting {
   kAlways,
 };
 
-/// Rounds up by at most an eighth, to one of eight numbers in each octave. Torch's allocator uses buffers of few sizes
-/// again, and else keeps a block for every size.
+/// Rounds up by at most an eighth, to one of eight numbers in each octave: torch's allocator reuses buffers of few
+/// sizes, and keeps a block for every size.
 inline int64_t in_steps(int64_t number) {
   int64_t step = 1;
   while (number > 16 * step) step *= 2;
   return (number + step - 1) / step * step;
 }
 
-/// Of a class of images. Too little room is slow, not wrong. The first frames are counted; later frames get the room of
-/// the largest frame so far and a reserve, in steps. More Gaussians or tiles than ever enlarge it in proportion.
+/// Of a class of images. Too little room is slow, not wrong. The first frames are counted; later ones get the room of
+/// the largest so far and a reserve, in steps. More Gaussians or tiles than ever enlarge it in proportion.
 class PairGuess : PairGuessPolicy {
  public:
   /// Room for frame `frame`, at most `most`; 0: count its pairs.

@@ -1,6 +1,6 @@
 // The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients
-// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would call, in the
-// same order, and save the host the cost of autograd.
+// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would, in the same
+// order, without its cost to the host.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
 #include <ATen/ops/full.h>

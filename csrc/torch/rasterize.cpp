@@ -191,7 +191,7 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
 
     const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
     // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses memory that blend_vjp frees.
-    // And before the backend, whose destructor waits for zero_culled_grads.
+    // And before the backend, whose destructor waits for it.
     Grads grads = make_grads(a, needs);
     grads.mean_sums = mean_sums;
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);

@@ -1,7 +1,7 @@
 // The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are the same line of the
 // sphere, with a row for every place at which a splat may show (docs/internals/numerics.md, "Equirectangular
-// pictures"). And its adjoint. A splat that is wider than the turn overlaps itself: its opacity is lowered, so that all
-// of its copies together are as opaque as it was at its centre.
+// pictures"). And its adjoint. A splat wider than the turn overlaps itself: its opacity is lowered, so that its copies
+// together are as opaque as it was at its centre.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/exp.h>
@@ -24,7 +24,7 @@ namespace ar::ops {
 namespace {
 
 // Standard deviations along a row of pixels, in turns. Wider splats are narrowed to the first: their copies together
-// vary by 2% at most around the turn. Narrower than the second, copies do not overlap: exp(-32) is rounding.
+// vary by 2% at most. Narrower than the second, copies do not overlap: exp(-32) is rounding.
 constexpr double kWidest = 0.75, kOverlapping = 0.125;
 constexpr double kOpaque = 1 - 1e-6;  // The logarithm of 1 - opacity has to be finite.
 constexpr int kSteps = 6;             // Of Newton's method, for the opacity of copies.

@@ -2,8 +2,7 @@
 // (2 pi), h / pi px.
 //
 // Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude): nearer
-// to a pole all derivatives are those at that latitude, and finite (docs/internals/numerics.md, "Equirectangular
-// pictures").
+// to a pole derivatives are those at that latitude (docs/internals/numerics.md, "Equirectangular pictures").
 #pragma once
 
 #include "core/camera/lens_model.h"

@@ -1,5 +1,5 @@
-// How far a lens is a map, and how far a picture sees through it: `fold` and `reach` of core/lens.h, by rays in many
-// directions from the axis and at many angles. In double: near a fold derivatives cancel.
+// How far a lens is a map, and a picture sees through it: `fold` and `reach` of core/lens.h, by rays in many directions
+// and at many angles. In double: near a fold derivatives cancel.
 #pragma once
 
 #include <limits>

@@ -10,8 +10,7 @@ namespace ar {
 /// with positive weights. docs/internals/numerics.md, "The exact integral", has the rules and error bounds.
 ///
 /// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
-/// `tilt`. A Gaussian that is narrow across the ridge z.y = 0 is integrated in strips around the points where the
-/// pixel's edges cross it.
+/// `tilt`. A Gaussian narrow across the ridge z.y = 0 is integrated in strips around where the pixel's edges cross it.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;

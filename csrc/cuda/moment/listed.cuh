@@ -1,8 +1,8 @@
 // Kernels filter and listed_blend: the forward pass for lists that are cut into segments. A tile may have hundreds of
 // thousands of splats, most of them smaller than a pixel. So `filter` tests every pair against every pixel, and writes
 // bits to reach_words. `listed_blend` composites in a pixel only splats that reach it, from a queue (queue.cuh), or
-// walks those that reach any of a warp's few pixels. It writes what moving_blend writes for other lists, but for
-// checkpoints within later segments, which segment_maps stores.
+// walks those that reach any of a warp's few pixels. It writes what moving_blend does, but for checkpoints within later
+// segments, which segment_maps stores.
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -165,9 +165,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
 };
 
-/// Composites n staged splats of this lane's pixel, from first_staged on. Most show in no sample. So the lanes of a
-/// sample test kAhead splats at once and composite the first that shows. They test the later ones again, since the node
-/// has moved.
+/// Composites n staged splats of this lane's pixel, from first_staged on. Most show in no sample, so the lanes of a
+/// sample test kAhead at once and composite the first that shows; then the node has moved, and they test the later ones
+/// again.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;

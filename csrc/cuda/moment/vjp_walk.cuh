@@ -1,7 +1,6 @@
-// Kernel moving_vjp: the backward pass for lists that are not cut. The state before a splat does not follow from the
-// state after it. So a warp composites each chunk of 32 splats once more from the checkpoint before it, and stores the
-// positions before each splat. Then it walks back over the splats that its pixels show. segment_vjp shares batch_vjp
-// and launch_vjp.
+// Kernel moving_vjp: the backward pass for lists that are not cut. The state before a splat does not follow from that
+// after it. So a warp composites each chunk of 32 splats again from the checkpoint before it, stores the positions
+// before each splat, and walks back over the splats that its pixels show. segment_vjp shares batch_vjp and launch_vjp.
 #pragma once
 
 #include <algorithm>

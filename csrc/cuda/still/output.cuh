@@ -1,6 +1,5 @@
-// What blend_front and the tail share: addresses of a pixel's checkpoints (PixelCheckpoints, TransmittancePlanes),
-// store_pixel(), which writes a finished pixel, and accumulate_farther(), which makes the checkpoints where blend_vjp
-// starts.
+// What blend_front and the tail share: addresses of a pixel's checkpoints (PixelCheckpoints, TransmittancePlanes);
+// store_pixel() writes a finished pixel, accumulate_farther() the checkpoints where blend_vjp starts.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"

@@ -2,8 +2,7 @@
 //
 // A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one, in still/vjp.cuh all. Subtile b is
 // in column b % 2 and row b / 2 of the tile, and the pixel of lane l in column l % 8 and row l / 8 of the subtile. With
-// a Spread (core/footprint/contract.h) a lane has one sample: neighbouring lanes share a pixel, and the tile has fewer
-// pixels.
+// a Spread (core/footprint/contract.h) a lane has one sample: neighbouring lanes share a pixel of a smaller tile.
 #pragma once
 
 #include "core/blend.h"

@@ -9,8 +9,8 @@
 namespace ar::cuda {
 
 /// Which of kColumns x kRows boxes of kWide x kHigh pixels, from pixel (x0, y0) on, a splat reaches. Bit b: column b %
-/// kColumns, row b / kColumns. It may include boxes that the splat almost reaches: an exact test pays only if weights
-/// are expensive.
+/// kColumns, row b / kColumns. May include boxes that it almost reaches: an exact test pays only if weights are
+/// expensive.
 template <int kWide, int kHigh, int kColumns, int kRows, class F>
 __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
   static_assert(kColumns * kRows <= 32);

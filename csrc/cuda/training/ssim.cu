@@ -2,8 +2,8 @@
 // derivatives and sums of blocks, `loss` adds these sums up in a fixed order, and `ssim_vjp` makes the gradient of the
 // image from the partial derivatives.
 //
-// Sums go along rows, then along columns, in shared memory. A thread makes kRun neighbouring sums from registers, to
-// load less.
+// Sums go along rows, then columns, in shared memory. A thread makes kRun neighbouring sums from registers, to load
+// less.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
