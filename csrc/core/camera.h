@@ -1,5 +1,5 @@
 // A camera of any model: a mean's pixel, the Jacobian there, the blur, and the adjoints. The models are in
-// core/camera/. Most functions are compiled for two types: Camera is the pinhole of 3DGS, FullCamera has all models and
+// core/camera/. Most functions are compiled for two types: Camera, the pinhole of 3DGS, and FullCamera, all models and
 // effects as branches, which all threads take alike.
 #pragma once
 

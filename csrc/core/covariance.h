@@ -12,8 +12,7 @@ template <typename T> struct UnitQuaternion {
 
 /// Deviates: 3DGS expects unit quaternions.
 template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
-  // q.x is the w of the quaternion. Dividing by the largest keeps squares in range, the power of two keeps the division
-  // in range.
+  // q.x is the w of the quaternion. Dividing by the largest keeps squares in range, the power of two the division.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
   // max() may drop a NaN; the sum does not.
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};

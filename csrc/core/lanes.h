@@ -118,8 +118,8 @@ AR_HD double exp2(double x) { return std::exp2(x); }
 /// Within 4 ulp for normal results.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-// On a device sqrt and quotient lack the compiler's branch for numbers near the ends of the range, which instructions
-// cannot be moved around.
+// On a device sqrt and quotient lack the compiler's branch for extreme numbers, which instructions cannot be moved
+// around.
 
 /// Rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {

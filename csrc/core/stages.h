@@ -33,14 +33,14 @@ struct TileGrid {
 AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
-/// The tiles on CUDA if samples move. One sample in a large image is so cheap that larger tiles with fewer pairs pay.
-/// In a small image sixteen samples want shorter lists.
+/// The tiles on CUDA if samples move. One sample in a large image is so cheap that larger tiles with fewer pairs pay;
+/// in a small one sixteen want shorter lists.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. In large images more pairs would
-/// cost more than shorter lists save.
+/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. In large images more pairs cost
+/// more than shorter lists save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }

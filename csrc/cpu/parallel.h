@@ -1,5 +1,5 @@
-// Loops whose items threads share: a library for the CPU path. Every item writes to its own memory, so that results do
-// not depend on the number of threads.
+// Loops whose items threads share: a library for the CPU path. Every item writes to its own memory: results do not
+// depend on the number of threads.
 #pragma once
 
 #include <cstdint>

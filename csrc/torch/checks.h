@@ -1,5 +1,5 @@
-// What the ops accept, on every device. Ops call check() before they touch anything. A wrong dtype raises TypeError,
-// anything else ValueError: `means3D must have shape (P, 3), got (5, 2)`.
+// What the ops accept, on every device, checked before they touch anything. A wrong dtype raises TypeError, anything
+// else ValueError: `means3D must have shape (P, 3), got (5, 2)`.
 #pragma once
 
 #include "torch/backend.h"

@@ -40,8 +40,8 @@ inline bool is_capturing(cudaStream_t stream) {
   return status != cudaStreamCaptureStatusNone;
 }
 
-/// From here on, frames of samples that move are always counted for a backward pass: room for a pair takes hundreds of
-/// bytes of checkpoints, and waiting takes little of such a frame.
+/// From here on, frames of samples that move are counted for a backward pass: a pair takes hundreds of bytes of
+/// checkpoints, waiting little of such a frame.
 inline constexpr int64_t kCountedGaussians = 1 << 23;
 
 inline cuda::Counting counting_of(const Pass& pass, int64_t gaussians, cudaStream_t stream) {

@@ -1,5 +1,5 @@
-// Tensors as structs of the CUDA kernels. SplatMemory, PairMemory and PlanMemory put several arrays into one tensor,
-// since a tensor costs the host microseconds. The checks are of sizes that checks.h cannot know.
+// Tensors as structs of the CUDA kernels. SplatMemory, PairMemory and PlanMemory put arrays into one tensor: a tensor
+// costs the host microseconds. The checks are of sizes that checks.h cannot know.
 #pragma once
 
 #include <utility>

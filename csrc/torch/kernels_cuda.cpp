@@ -1,5 +1,5 @@
 // For tests, functions of _C about kernels: launched_kernels(), the names of those launched while recording, and
-// blend_route(), the names that cuda/dispatch.h has for a footprint. It contains no kernels.
+// blend_route(), those of cuda/dispatch.h for a footprint.
 #include <cuda_runtime_api.h>
 
 #include <mutex>

@@ -1,5 +1,5 @@
 // Registers the ops of ops.h with torch: a schema made from the arguments, and one kernel for all devices. And the
-// Python module _C, which loads them, with names and widths for Python, and a few functions that are no ops.
+// Python module _C, which loads them, with names, widths, and a few functions that are no ops.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>

@@ -1,5 +1,5 @@
-// How much room to reserve for the pairs of a frame, guessed from earlier frames. Host code, for
-// torch/backend_cuda.cpp: the device writes the number of pairs into host memory, where a later frame reads it.
+// How much room to reserve for the pairs of a frame, guessed from earlier ones. Host code, for torch/backend_cuda.cpp:
+// the device writes the number into host memory, where a later frame reads it.
 #pragma once
 
 #include <algorithm>

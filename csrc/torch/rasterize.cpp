@@ -16,8 +16,8 @@
 namespace ar::ops {
 namespace {
 
-/// What is blended: colours, features, depth, inverse depth. Three colours alone lie in the splats. Anything else needs
-/// rows: `made`, which the forward pass saved, or new ones.
+/// What is blended: colours, features, depth, inverse depth. Three colours alone lie in the splats, anything else in
+/// rows: `made` by the forward pass, or new ones.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   const int64_t colors = a.bg.size(0), depths = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
   const bool three = colors == 3;

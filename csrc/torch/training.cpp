@@ -1,6 +1,5 @@
 // The ops of a training step besides rendering: loss, activations, 3D filter, colour correction, density control
-// (observe_, add_noise_) and optimiser, with adjoints. They check, allocate, and call the device's TrainingKernels
-// (training.h).
+// (observe_, add_noise_) and optimiser, with adjoints. They check, allocate, and call TrainingKernels (training.h).
 #include "torch/training.h"
 
 #include "torch/checks.h"

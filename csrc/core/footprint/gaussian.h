@@ -1,5 +1,5 @@
 // Shared by the footprints that are Gaussians: point, mip, box and moment, and in part by others. A Gaussian is stored
-// as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become positive, and does not
+// as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 is never positive, and does not
 // cancel for long needles as the conic form does (docs/internals/numerics.md, "Whitening").
 #pragma once
 

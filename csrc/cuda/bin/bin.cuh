@@ -1,7 +1,7 @@
 // Kernels that make the lists of tiles; forward.cu launches them. count_depths counts splats, pairs and digits of
 // depths, and gives splats slots for gradients. After the sort by depth (sort.cuh), emit_pairs writes a pair for each
-// tile of a splat, emit_long_pairs where the tiles are not among 8x8, or are patches as room is short. After the sort
-// by tile, tile_offsets finds the first pair of each tile.
+// tile of a splat, emit_long_pairs of splats whose tiles are not among 8x8, or of patches where room is short. After
+// the sort by tile, tile_offsets finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>

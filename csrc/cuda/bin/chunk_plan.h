@@ -1,6 +1,5 @@
-// How lists are cut into chunks (front_chunks, ListCut), in which order work begins (ChunkPlan), and how the
-// checkpoints of still/ lie in memory (CheckpointLayout). The kernels of plan.cuh write the plan, the kernels of
-// blending read it.
+// How lists are cut into chunks (front_chunks, ListCut), the order of work (ChunkPlan), and how checkpoints of still/
+// lie in memory (CheckpointLayout). Kernels of plan.cuh write the plan, those of blending read it.
 #pragma once
 
 #include <cstdint>
@@ -18,9 +17,9 @@ inline constexpr int kChunkLength = 256;
 inline constexpr int kWholeList = 1 << 30;
 inline constexpr int kNoList = 1 << 30;
 
-/// Chunks in the front of a tile. The others, the tail, are blended side by side, which takes more work. The front is
-/// short if the tiles cannot fill the device. Else it is a block's share of all `pairs` or more, so that fewer than
-/// blocks_at_once tiles have a tail.
+/// Chunks in the front of a tile. The others, the tail, are blended side by side, which is more work. The front is
+/// short if the tiles cannot fill the device, else a block's share of all `pairs` or more: fewer than blocks_at_once
+/// tiles have a tail.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more pairs there are patches
   if (2 * grid.tiles() <= blocks_at_once) return StillPolicy::kShortFront;

@@ -1,5 +1,5 @@
-// A pass of a stable radix sort, for a number of items that only the device knows. It is "Onesweep" of Adinets and
-// Merrill (2022): a block adds up what earlier blocks have published.
+// A pass of a stable radix sort, for a number of items that only the device knows: "Onesweep" of Adinets and Merrill
+// (2022), where a block adds up what earlier ones have published.
 #pragma once
 
 #include "cuda/bin/policy.h"

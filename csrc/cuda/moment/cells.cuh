@@ -182,8 +182,8 @@ template <class F, class Layout> struct CellCorners {
 
 template <class Layout> inline constexpr int kListAhead = MomentPolicy::list_ahead(Layout::kCells);
 
-/// A batch of splats, and for each warp a list of up to kListed of them that reach its pixels. kOffsets: entries are
-/// offsets in memory, not indices.
+/// A batch of splats, and for each warp a list of up to kListed that reach its pixels. kOffsets: of offsets in memory,
+/// not indices.
 template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffsets = false> struct MovingStage {
   static_assert(kBatch % 32 == 0);
   using Lists =
@@ -217,8 +217,8 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
 /// A lane's share of a pixel.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
-  /// Whether the warp first votes if any sample shows the splat. That pays with several cells in a lane and few pixels
-  /// in a warp; kKeep needs the registers.
+  /// Whether the warp first votes if any sample shows the splat: pays with several cells in a lane and few pixels in a
+  /// warp; kKeep needs the registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   Pixel pixel;
   MovingSamples<F, Layout, kTogether> samples;

@@ -1,5 +1,5 @@
 // Kernels of projection. `project` writes splats of Gaussians, radii, rows of channels, and what bin reads (keys,
-// counts, tiles). `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or to send to
+// counts, tiles). `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or send to
 // another rank. `shape_rows` turns public rows into splats.
 #pragma once
 

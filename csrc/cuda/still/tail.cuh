@@ -1,6 +1,6 @@
 // Kernels that finish the tiles that blend_front has left open. tail_through finds how much light each chunk lets
-// through, tail_scan multiplies this up to the transmittance at the begin of each chunk, tail_blend composites each
-// chunk from there, and tail_sum adds the chunks up and writes images.
+// through, tail_scan multiplies this up to the transmittance before each chunk, tail_blend composites each chunk from
+// there, and tail_sum adds the chunks up and writes images.
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -1,5 +1,5 @@
-// A step of Adam on several tensors at once. One kernel reads gradients, and updates parameters and moments: a block
-// has a part of one tensor.
+// A step of Adam on several tensors at once: one kernel updates parameters and moments; a block has a part of one
+// tensor.
 #include "core/adam.h"
 
 #include "cuda/launch.cuh"

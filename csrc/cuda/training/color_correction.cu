@@ -1,5 +1,5 @@
 // The correction of a picture's colours and its adjoint. `correct_vjp` writes sums of blocks for the gradient of the
-// matrix, and `sum_blocks` adds these up in a fixed order.
+// matrix, `sum_blocks` adds these up in a fixed order.
 #include "core/color_correction.h"
 
 #include "cuda/launch.cuh"
