@@ -1,7 +1,7 @@
 """A moving picture of the fruit fly from afar: the same path as the mesh, as `point` and as `moment` show it.
 
-    python examples/fruit_fly.py --out DIR
-    python examples/moving_fly.py DIR --out moving.png
+    python examples/fruit_fly.py --out DIR --views 60 --size 256 --steps 1500 --gaussians 20000
+    python examples/moving_fly.py DIR --out docs/images/moving.png
 
 The first line trains the scenes. Every frame has the mesh, rendered by MuJoCo with 4x4 samples in a pixel, the scene
 trained and drawn with `point` (3DGS), and the scene trained and drawn with `moment`. The size is a fraction of the
@@ -22,7 +22,7 @@ from analytic_rasterizer import io
 
 TITLES = ("mesh", "point (3DGS)", "moment")
 SWING = 14, 5  # degrees, of azimuth and elevation
-LABEL, GAP = 26, 6  # px
+LABEL, GAP, FONT = 44, 6, 34  # px
 PAPER, INK = (255, 255, 255), (40, 40, 45)
 MILLISECONDS = 70  # of a frame
 COLORS = 128
@@ -41,10 +41,10 @@ def frame(pictures: list[torch.Tensor], box: tuple[int, int, int, int], zoom: in
     left, top, right, bottom = box
     width, height = zoom * (right - left), zoom * (bottom - top)
     sheet = image.new("RGB", (len(pictures) * (width + GAP) - GAP, LABEL + height), PAPER)
-    draw, font = draw_module.Draw(sheet), fonts.load_default(18)
+    draw, font = draw_module.Draw(sheet), fonts.load_default(FONT)
     for k, (title, picture) in enumerate(zip(TITLES[-len(pictures) :], pictures)):
         x = k * (width + GAP)
-        draw.text((x + width / 2, 2), title, INK, font, anchor="ma")
+        draw.text((x + width / 2, 0), title, INK, font, anchor="ma")
         sheet.paste(io.to_image(picture).crop(box).resize((width, height), image.NEAREST), (x, LABEL))
     return sheet
 

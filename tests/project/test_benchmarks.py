@@ -99,6 +99,20 @@ def test_footprint_figure(tmp_path, run):
     assert (moment - truth).abs().max() < 0.02 < (one_weight - truth).abs().max()
 
 
+def test_accuracy_figure(tmp_path, run):
+    """The figures have the numbers of the documents' tables: a row that is renamed, or gone, is missed here."""
+    pytest.importorskip("matplotlib", reason="needs the analysis extra")
+    figure = importlib.import_module("accuracy_figure")
+    run(figure, "--out", tmp_path)
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("accuracy_time.png", "errors_weight.png"))
+    for psnr_column, time_column, _ in figure.SCENES:
+        shown = {name: (time, psnr) for name, time, psnr in figure.points(psnr_column, time_column)}
+        assert len(shown) == 10 and shown["moment, 4"][1] > shown["box, 1"][1] + 10 > shown["point"][1] + 20
+    text = (figure.DOCS / "performance.md").read_text()
+    assert f"{shown['moment, 4'][0]} / " in text  # of a cell with two numbers the first
+    assert set(figure.LINES) <= set(figure.table(figure.DOCS / "accuracy.md", "The weight"))
+
+
 def test_dialects(run):
     """A row for every dialect, and both calls of each make the same images."""
     benchmark = importlib.import_module("dialects")

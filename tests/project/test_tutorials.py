@@ -36,6 +36,7 @@ VIEWS = files.circle(9, SIZE)
 SHORTER = {  # in Python: what is replaced, once
     "train.md": {"iterations=7000": "iterations=40"},
     "loop.md": {"steps, scale = 7000, 2": "steps, scale = 1000, 1"},
+    "poses.md": {"steps, scale = 3000, 2": "steps, scale = 600, 2"},
 }
 
 AS_TYPED = """
@@ -406,3 +407,15 @@ def test_loop(tmp_path):
 def test_every_tutorial_has_a_test():
     pages = {path.stem.replace("-", "_") for path in TUTORIALS.glob("*.md")}
     assert all(f"test_{page}" in globals() for page in pages)
+
+
+# ------------------------------------------------------------------------------------- poses.md
+
+
+def test_poses(tmp_path):
+    make_colmap(tmp_path / "garden")
+    reader = Reader("poses.md", tmp_path)
+    reader.follow()
+    before, after = (float(number) for number in re.findall(r"poses \w+: ([\d.]+)", reader.output["python"][0]))
+    assert after < before / 5
+    assert picture(tmp_path / "mended.png").shape == (SIZE[1] // 2, SIZE[0], 3)
