@@ -104,7 +104,7 @@ def test_one_variable_gives_the_addresses(tmp_path):
     }
     description = metadata.get_payload()
     assert "[docs/install.md](https://example.org/a/b/blob/main/docs/install.md)" in description
-    assert "](https://example.org/a/b/raw/main/docs/images/demo.png)" in description
+    assert "](https://example.org/a/b/raw/main/docs/images/moving.png)" in description
     assert not re.search(r"\]\((?!https://|#)", description)
 
 
