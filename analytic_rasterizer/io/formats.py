@@ -22,6 +22,7 @@ FORMATS = {
     ".usdz": "usd",
 }
 """Formats of scenes, by `suffix_of`."""
+HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
 
 
 def scene_file(path) -> tuple[Path, str]:
@@ -45,3 +46,9 @@ def scene_file(path) -> tuple[Path, str]:
 def suffix_of(path: Path) -> str:
     """The suffix in lower case; that of an unbundled .sog is the whole name of its meta.json."""
     return SOG_META if path.name.lower() == SOG_META else path.suffix.lower()
+
+
+def check_harmonics(count: int) -> None:
+    """Raises SceneError for another number of properties f_rest_0, f_rest_1, .. than a degree has."""
+    if count not in HARMONICS:
+        raise SceneError(f"expected 0, 9, 24, 45 or 72 f_rest properties (SH degree 0 to 4), got {count}")

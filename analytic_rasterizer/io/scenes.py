@@ -14,7 +14,7 @@ from . import gltf, ply, sog, splat, spz, usd
 from .axes import axes_of_format, axes_written, checked_axes, flipped, with_axes
 from .compressed import is_compressed, read_compressed, to_compressed
 from .errors import SceneError, first_line, naming
-from .formats import SOG_META, scene_file, suffix_of
+from .formats import SOG_META, check_harmonics, scene_file, suffix_of
 from .metadata import SceneMetadata, read_axes
 from .points import AXES as POSITION
 from .points import has_colors, read_colors
@@ -25,7 +25,6 @@ BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 PLY_COLUMNS = [*POSITION, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
 """Properties that a vertex of a 3DGS .ply must have; harmonics beyond the constant follow as f_rest_0, f_rest_1, ..."""
-HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
 WRITTEN = {
     ".ply": "ply",
     ".ply_compressed": "compressed",
@@ -140,8 +139,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         if missing:
             raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
         count = sum(name.startswith("f_rest_") for name in rows.names)
-        if count not in HARMONICS:
-            raise SceneError(f"expected 0, 9, 24, 45 or 72 f_rest properties (SH degree 0 to 4), got {count}")
+        check_harmonics(count)
         shs = np.empty((len(rows), 1 + count // 3, 3), np.float32)
         if colored:
             shs[:, 0] = (read_colors(rows) - 0.5) / SH_C0

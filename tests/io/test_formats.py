@@ -424,7 +424,7 @@ COMPRESSED = {
 
 @pytest.mark.parametrize("name", COMPRESSED)
 def test_compressed_scenes_whatever_the_file(tmp_path, name):
-    """gsply takes elements for what it expects at their place, and text for ASCII."""
+    """Elements are found by their names."""
     path = tmp_path / "a.compressed.ply"
     io.save_scene(path, random_gaussians(count=300, degree=1))
     expected = io.load_scene(path)
@@ -432,6 +432,24 @@ def test_compressed_scenes_whatever_the_file(tmp_path, name):
     assert io.is_scene(path)
     for found, wanted in zip(io.load_scene(path), expected):
         assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_a_compressed_scene_is_what_gsply_reads_without_it(tmp_path, monkeypatch, degree):
+    """It compiles for seconds, also before a broken file is refused."""
+    path, scene = tmp_path / "a.compressed.ply", random_gaussians(count=3000, degree=degree)
+    scene.logit_opacities[:2, 0] = torch.tensor([30.0, -30.0])  # bytes of 255 and 0
+    io.save_scene(path, scene)
+    expected = pytest.importorskip("gsply").decompress_from_bytes(path.read_bytes())
+    monkeypatch.setitem(sys.modules, "gsply", None)
+    found = io.load_scene(path)
+    read = [(found.means, expected.means), (found.log_scales, expected.scales), (found.rotations, expected.quats)]
+    read += [(found.shs[:, 0], expected.sh0), *([(found.shs[:, 1:], expected.shN)] if degree else [])]
+    for own, other in read:
+        assert own.shape == other.shape
+        np.testing.assert_allclose(own, other, rtol=0, atol=2 * 4 * 8 * 2**-24)  # both: four roundings, below 8
+    # Both: a share up to 1 - 1/255 is rounded, its inverse and the difference from 1 too, of which 1/255 is left.
+    np.testing.assert_allclose(found.logit_opacities[:, 0], expected.opacities, rtol=0, atol=2 * 3 * 255 * 2**-24)
 
 
 def test_a_compressed_scene_without_limits_of_colours(tmp_path):
@@ -451,6 +469,7 @@ def test_a_compressed_scene_without_limits_of_colours(tmp_path):
     [
         (lambda c, v, s: ply(cut(c, 1), v, s), "a chunk for every 256 of 300 vertices, got 1"),
         (lambda c, v, s: ply(c, v, cut(s, 7)), "harmonics of 300 vertices in bytes, got 7"),
+        (lambda c, v, s: ply(c, v, cut(s, 300, 7)), "0, 9, 24, 45 or 72 f_rest properties .*, got 7"),
         (lambda c, v, s: ply(c, cut(v, 300, 3), s), "packed_color once"),
         (lambda c, v, s: ply(c, v, s)[:-1], "cut short"),
         (lambda c, v, s: ply(c, v, s).replace(b"vertex 300", b"vertex 4000000000"), "that fits .* got 4000000000"),
