@@ -18,6 +18,7 @@ from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
 from .parts import BACKGROUNDS, RANDOM_BACKGROUND
+from .pictures import read_sizes
 from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
 
@@ -52,8 +53,8 @@ def of_length(
     return stored
 
 
-def pixel_limit(options: TrainingOptions, views: Sequence[io.View], chosen: Collection[str] = ()) -> int | None:
-    """As many Gaussians as pictures of these views can show, by `pixels_per_gaussian`.
+def pixel_limit(options: TrainingOptions, sizes: Sequence[tuple[int, int]], chosen: Collection[str] = ()) -> int | None:
+    """As many Gaussians as pictures of these sizes [px] can show, by `pixels_per_gaussian`.
 
     None where another limit was chosen, or this one is no lower.
     """
@@ -61,7 +62,7 @@ def pixel_limit(options: TrainingOptions, views: Sequence[io.View], chosen: Coll
     if not usual or options.pixels_per_gaussian == 0 or options.density == "none":
         return None
     finest = min(options.scales)
-    pixels = sum((view.width // finest) * (view.height // finest) for view in views)
+    pixels = sum((width // finest) * (height // finest) for width, height in sizes)
     limit = max(round(pixels / options.pixels_per_gaussian), FEWEST)
     return limit if limit < options.max_gaussians else None
 
@@ -73,7 +74,8 @@ def begin(
 
     It is no less than twice the Gaussians of the start: fewer learn worse, also of random ones.
     """
-    limit = pixel_limit(options, [item.view for item in capture.train], chosen)
+    # Of the files: photographs are often smaller than their cameras say, as those of images_4 are.
+    limit = pixel_limit(options, [header[:2] for _, header in read_sizes(capture.train)], chosen)
     start, found = first_gaussians(options, capture, points, chosen)
     said = []
     if limit is not None:

@@ -5,6 +5,7 @@ import json
 import pytest
 import train_extra  # noqa: F401
 from capture_files import circle, write_nerf_synthetic
+from cli_extra import image
 from wall import cameras, write_wall
 
 from analytic_rasterizer import cli, training
@@ -34,14 +35,14 @@ from analytic_rasterizer.training import TrainingOptions, files, start
 )
 def test_the_limit(options, views, expected):
     count, width, height = views
-    of_size = circle(count, (width, height))
+    of_size = [(width, height)] * count
     limit = start.pixel_limit(TrainingOptions(**options), of_size)
     assert limit == (None if expected is None else pytest.approx(expected, rel=0.02))
     assert start.pixel_limit(TrainingOptions(**options), of_size, ["max_gaussians"]) is None
 
 
 def test_the_recipe_of_3dgs_has_no_limit():
-    assert start.pixel_limit(TrainingOptions.preset("3dgs"), circle(3, (8, 8))) is None
+    assert start.pixel_limit(TrainingOptions.preset("3dgs"), [(8, 8)] * 3) is None
 
 
 def test_a_training_says_it_and_keeps_it(tmp_path, capsys):
@@ -58,6 +59,15 @@ def test_a_training_says_it_and_keeps_it(tmp_path, capsys):
     assert said not in capsys.readouterr().err
     history = [json.loads(line) for line in (tmp_path / "out" / files.LOG).read_text().splitlines()]
     assert 0 < max(entry["gaussians"] for entry in history) <= start.FEWEST
+
+
+def test_pixels_are_those_of_the_files(tmp_path):
+    """Of images_4, for example, which has the cameras of the whole photographs."""
+    write_nerf_synthetic(tmp_path / "capture", circle(10), circle(2))
+    for path in (tmp_path / "capture" / "train").iterdir():
+        image.open(path).resize((16, 16)).save(path)
+    options = TrainingOptions(iterations=1, effects="none", random_points=4, pixels_per_gaussian=1.0)
+    assert training.Run(tmp_path / "capture", tmp_path / "out", options).options.max_gaussians == 10 * 16 * 16
 
 
 def test_random_points_of_the_start_stay(tmp_path):
