@@ -135,7 +135,6 @@ def check_photographs(browser, query=""):
         open_page(browser, f"{server.url}{query}", reduced_motion="reduce", size=(480, 240)) as page,
     ):
         wait_for_frame(page)
-        page.keyboard.press("h")
         alone = picture(page)
         page.select_option("#compare", "photograph", force=True)
         assert page.text_content("#label-right") == "photograph of facing"

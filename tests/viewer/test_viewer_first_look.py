@@ -86,7 +86,10 @@ def test_the_page_says_plainly_which_footprint_is_drawn(browser):
 
 
 @pytest.mark.gate
-@pytest.mark.parametrize("size, most", [((800, 450), 0.28), ((1280, 720), 0.3), ((120, 90), 0.35), ((320, 120), 0.2)])
+@pytest.mark.parametrize(
+    "size, most",
+    [((1280, 720), 0.3), ((800, 450), 0.28), ((320, 240), 0.25), ((480, 800), 0.1), ((320, 120), 0.2), ((120, 90), 0.35)],
+)
 def test_the_controls_leave_most_of_the_scene_free(browser, size, most):
     with (
         serve(random_scene(50), [facing()], footprint="moment:samples=4") as server,
@@ -96,12 +99,20 @@ def test_the_controls_leave_most_of_the_scene_free(browser, size, most):
         settle(page)
         assert page.evaluate(AREA) < most
         assert page.is_visible("#fold")
-        assert page.is_visible("#footprint") == (min(size) > 160)
+        assert page.is_visible("#footprint") == (size[0] > 480 and size[1] > 360)
         outside = page.evaluate(
             """() => [...document.querySelectorAll('#panel, #figures')].map(e => e.getBoundingClientRect()).filter(
                  box => box.left < 0 || box.top < 0 || box.right > innerWidth || box.bottom > innerHeight).length"""
         )
         assert outside == 0
+
+
+def test_the_controls_fold_where_the_window_becomes_small(browser):
+    with serve(random_scene(10), [facing()]) as server, open_page(browser, server.url, size=(800, 450)) as page:
+        wait_for_frame(page)
+        for size, shown in (((480, 450), False), ((800, 450), True), ((800, 360), False), ((800, 450), True)):
+            page.set_viewport_size(dict(zip(("width", "height"), size)))
+            wait_for(page, f"() => document.body.classList.contains('folded') === {str(not shown).lower()}")
 
 
 @pytest.mark.gate

@@ -338,7 +338,6 @@ def test_the_divider_and_the_heat_map_compare_any_two(controls):
     def picture():
         return screenshot(controls)[50:100]  # without names and controls
 
-    controls.keyboard.press("h")
     moment = picture()
     controls.keyboard.press("c")
     assert controls.text_content("#label-right") == "point"
@@ -377,7 +376,6 @@ def test_what_the_screen_shows_is_the_picture(browser):
     scene = random_scene(500)
     expected = rendered(scene, view, "moment:samples=4").clip(0, 1).transpose(1, 2, 0)
     with gpu_page_of(browser, scene, view, wait=wait_for_frame, footprint="moment") as page:
-        page.keyboard.press("h")
         shown = screenshot(page)
         assert np.abs(shown - 255 * expected)[50:100].max() <= 1.5
         with page.expect_download() as download:

@@ -1,6 +1,6 @@
 // WGSL of the lists of tiles, after csrc/core/bin.h: passes that write pairs of a splat and a tile that it touches.
 
-import { FRAME, TILE, WORKGROUP } from './frame.wgsl.js';
+import { FRAME, MAIN, TILE, WORKGROUP, bindings } from './frame.wgsl.js';
 import { KINDS } from './footprint.wgsl.js';
 import { GROUP_SCAN, SORT_BLOCK, scanOf } from './sort.wgsl.js';
 
@@ -45,9 +45,7 @@ fn tileColumnsOf(s: Support, rows: vec2i, tileRow: i32) -> vec2i {
 
 /// After the first pass over depths: how many Gaussians are visible, and workgroups for them.
 export const COUNT_VISIBLE = `
-@group(0) @binding(0) var<storage, read> totals: array<u32>;
-@group(0) @binding(1) var<storage, read_write> counts: array<u32>;
-@group(0) @binding(2) var<storage, read_write> arguments: array<u32>;
+${bindings('read totals: array<u32>', 'write counts: array<u32>', 'write arguments: array<u32>')}
 @compute @workgroup_size(1)
 fn main() {
   var n = 0u;
@@ -59,12 +57,8 @@ fn main() {
 
 /// How many tiles the visible splats of each workgroup of emit have.
 export const SCAN_REDUCE = `${GROUP_SCAN}
-@group(0) @binding(0) var<storage, read> counts: array<u32>;
-@group(0) @binding(1) var<storage, read> order: array<u32>;
-@group(0) @binding(2) var<storage, read> tiles: array<u32>;
-@group(0) @binding(3) var<storage, read_write> blocks: array<u32>;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+${bindings('read counts: array<u32>', 'read order: array<u32>', 'read tiles: array<u32>', 'write blocks: array<u32>')}
+${MAIN}
   let at = block.x * ${WORKGROUP}u + t;
   var x = 0u;
   if (at < counts[1]) { x = tiles[order[at]]; }
@@ -74,13 +68,10 @@ fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: v
 
 /// Sums over them; the number of pairs, and workgroups for them. Sums end at 2^32 - 1, beyond what there is room for.
 export const SCAN_BLOCKS = `${FRAME}${GROUP_SCAN}
-@group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read_write> counts: array<u32>;
-@group(0) @binding(2) var<storage, read_write> blocks: array<u32>;
-@group(0) @binding(3) var<storage, read_write> arguments: array<u32>;
+${bindings(
+  'uniform frame: Frame', 'write counts: array<u32>', 'write blocks: array<u32>', 'write arguments: array<u32>')}
 var<workgroup> number: u32;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32) {
+${MAIN}
   if (t == 0u) { number = (counts[1] + ${WORKGROUP - 1}u) / ${WORKGROUP}u; }
   let n = workgroupUniformLoad(&number);${scanOf('blocks', '0u')}
   if (t == 0u) {
@@ -93,14 +84,9 @@ fn main(@builtin(local_invocation_index) t: u32) {
 
 /// A thread writes the pairs of a splat in few tiles; the workgroup together those of the others.
 export const emit = kind => `${FRAME}${GROUP_SCAN}${KINDS[kind].functions}
-@group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> counts: array<u32>;
-@group(0) @binding(2) var<storage, read> order: array<u32>;
-@group(0) @binding(3) var<storage, read> blocks: array<u32>;
-@group(0) @binding(4) var<storage, read> tiles: array<u32>;
-@group(0) @binding(5) var<storage, read> splats: array<Splat>;
-@group(0) @binding(6) var<storage, read_write> keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> values: array<u32>;
+${bindings(
+  'uniform frame: Frame', 'read counts: array<u32>', 'read order: array<u32>', 'read blocks: array<u32>',
+  'read tiles: array<u32>', 'read splats: array<Splat>', 'write keys: array<u32>', 'write values: array<u32>')}
 ${support(kind)}
 var<workgroup> starts: array<u32, ${WORKGROUP}>;  // the first pair of each splat
 var<workgroup> large: array<u32, ${WORKGROUP}>;
@@ -130,8 +116,7 @@ fn write(place: u32, first: u32, step: u32) {
   }
 }
 
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+${MAIN}
   let place = block.x * ${WORKGROUP}u + t;
   var number = 0u;
   if (place < counts[1]) { number = tiles[order[place]]; }
@@ -152,11 +137,8 @@ fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: v
 
 /// Where the pairs of each tile begin and end.
 export const RANGES = `
-@group(0) @binding(0) var<storage, read> counts: array<u32>;
-@group(0) @binding(1) var<storage, read> keys: array<u32>;
-@group(0) @binding(2) var<storage, read_write> ranges: array<vec2u>;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+${bindings('read counts: array<u32>', 'read keys: array<u32>', 'write ranges: array<vec2u>')}
+${MAIN}
   let n = counts[2];
   for (var k = 0u; k < ${SORT_BLOCK / WORKGROUP}u; k++) {
     let at = block.x * ${SORT_BLOCK}u + k * ${WORKGROUP}u + t;

@@ -3,7 +3,7 @@
 
 import { shaderNumber } from './constants.js';
 import { KINDS, sampleOf, sampling } from './footprint.wgsl.js';
-import { FRAME, TILE } from './frame.wgsl.js';
+import { FRAME, TILE, bindings } from './frame.wgsl.js';
 
 const BATCH = TILE * TILE;  // splats in workgroup memory at once: one for each thread
 
@@ -17,12 +17,9 @@ export function blend(footprint) {
           if (next >= kTransmittanceMin) { T${s} = next; contribution += part; ${move} } else { T${s} = -abs(T${s}); }
         }`;
   return `${FRAME}${functions}
-@group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<uniform> band: vec4u;  // x: the first row of tiles
-@group(0) @binding(2) var<storage, read> ranges: array<vec2u>;
-@group(0) @binding(3) var<storage, read> pairs: array<u32>;
-@group(0) @binding(4) var<storage, read> splats: array<Splat>;
-@group(0) @binding(5) var<storage, read_write> picture: array<vec4f>;
+${bindings(
+  'uniform frame: Frame', 'uniform band: vec4u', 'read ranges: array<vec2u>', 'read pairs: array<u32>',
+  'read splats: array<Splat>', 'write picture: array<vec4f>')}
 ${Array.from({ length: slots }, (_, k) => `var<workgroup> slot${k}: array<vec4f, ${BATCH}>;`).join('\n')}
 var<workgroup> colors: array<vec3f, ${BATCH}>;
 var<workgroup> openPixels: atomic<u32>;

@@ -29,6 +29,18 @@ struct Frame {
 struct Splat { a: vec4f, b: vec4f, c: vec4f }
 `;
 
+const ACCESS = { uniform: 'uniform', read: 'storage, read', write: 'storage, read_write' };
+
+/// Declarations of the bindings 0, 1, ... of a pass, each 'uniform NAME: TYPE', 'read NAME: TYPE' or 'write NAME: TYPE'.
+export const bindings = (...declared) => declared.map((text, k) => {
+  const [access] = text.split(' ', 1);
+  return `@group(0) @binding(${k}) var<${ACCESS[access]}>${text.slice(access.length)};`;
+}).join('\n');
+
+/// The head of a pass of workgroups in one direction: thread t of a block.
+export const MAIN = `@compute @workgroup_size(${WORKGROUP})
+fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {`;
+
 /// A camera and a footprint as the struct above. `region` is [first column, first row, end column, end row] in tiles.
 export function frameData(camera, variance, reach, region, count, room) {
   const { width, height, fx, fy, cx, cy, w2c } = camera, { eye, limits } = eyeAndLimits(camera);

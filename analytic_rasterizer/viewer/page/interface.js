@@ -6,14 +6,21 @@ const element = id => document.getElementById(id);
 const DIVISORS = [1, 2, 4, 8];
 const COMPARISONS = ['off', 'split', 'difference'];
 const FLY_KEYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
+const BUTTONS = { previous: ',', next: '.', reset: 'r', screenshot: 'p', full: 'f', fold: 'h', 'help-open': '?' };
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const ARROW_STEP = 0.06;      // radians; with Shift, parts of the distance
 const WHEEL_STEP = 0.0015;    // logarithm of the distance, per px of scrolling
 const RADIANS_PER_PX = 0.006;
-// Where the controls would cover most of the scene, they are out of the way at first.
-const SMALL_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px), ' +
-  '(max-width: 240px), (max-height: 160px)';
+// Where the controls would cover much of the scene they are out of the way, until they are asked for.
+const SMALL_WINDOW = '(max-width: 480px), (max-height: 360px), (pointer: coarse) and (max-width: 640px), ' +
+  '(pointer: coarse) and (max-height: 480px)';
 export const READING_TIME = 4;  // seconds that a message stays
+
+/// Shows those of the sentences that are some, or hides the element.
+function showIfAny(id, sentences) {
+  element(id).textContent = sentences.filter(Boolean).join(' ');
+  element(id).hidden = element(id).textContent === '';
+}
 
 /// Colours of fields, '#rrggbb', and back.
 export const hexOf = rgb => `#${rgb.map(value => Math.round(255 * value).toString(16).padStart(2, '0')).join('')}`;
@@ -56,13 +63,16 @@ export class Interface {
     this.keys = new Set();
     this.pointers = new Map();
     this.surface = element('surface');
+    this.actions = this.actionsOf(viewer);
     this.fillIn(viewer.meta);
     this.showRenderer();
     this.connectControls();
     this.connectPointers();
     this.connectKeys();
     this.connectDivider();
-    if (matchMedia(SMALL_SCREEN).matches) this.toggleFolded();
+    const small = matchMedia(SMALL_WINDOW), fold = () => this.toggleFolded(small.matches);
+    small.addEventListener('change', fold);
+    fold();
     this.update();
   }
 
@@ -104,13 +114,7 @@ export class Interface {
     element('resolution').addEventListener('input', event => viewer.change({ divisor: DIVISORS[event.target.value] }));
     element('background').addEventListener('input', event => viewer.change({ background: rgbOf(event.target.value) }));
     element('view').addEventListener('change', event => viewer.goToView(Number(event.target.value)));
-    element('previous').addEventListener('click', () => viewer.stepView(-1));
-    element('next').addEventListener('click', () => viewer.stepView(1));
-    element('reset').addEventListener('click', () => viewer.goToView(viewer.camera.view));
-    element('screenshot').addEventListener('click', () => viewer.saveScreenshot());
-    element('full').addEventListener('click', () => this.toggleFullScreen());
-    element('help-open').addEventListener('click', () => element('help').showModal());
-    element('fold').addEventListener('click', () => this.toggleFolded());
+    for (const [id, key] of Object.entries(BUTTONS)) element(id).addEventListener('click', this.actions[key]);
   }
 
   connectPointers() {
@@ -125,8 +129,7 @@ export class Interface {
       pointers.delete(event.pointerId);
       if (pointers.size === 0) surface.classList.remove('dragged');
     };
-    surface.addEventListener('pointerup', release);
-    surface.addEventListener('pointercancel', release);
+    for (const end of ['pointerup', 'pointercancel']) surface.addEventListener(end, release);
     surface.addEventListener('pointermove', event => {
       const old = pointers.get(event.pointerId);
       if (!old) return;
@@ -173,7 +176,6 @@ export class Interface {
   press(event) {
     const { viewer } = this, key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     this.faster = event.shiftKey;
-    const state = viewer.state;
     if (key in FLY_KEYS) {
       this.keys.add(key);
       viewer.wake();
@@ -186,34 +188,37 @@ export class Interface {
       else viewer.orbit(-x, -y);
       return true;
     }
-    const { footprints, compared } = viewer.meta;
     if (/^[0-9]$/.test(key)) {
-      const chosen = footprints[(Number(key) + 9) % 10];  // 0 is the tenth
+      const chosen = viewer.meta.footprints[(Number(key) + 9) % 10];  // 0 is the tenth
       if (chosen && viewer.renderer.draws(chosen)) viewer.change({ footprint: chosen.name });
       return true;
     }
-    const actions = {
+    this.actions[key]?.();
+    return key in this.actions;
+  }
+
+  /// What keys and buttons do.
+  actionsOf(viewer) {
+    const { state, meta } = viewer, after = (list, now) => list[(list.indexOf(now) + 1) % list.length];
+    return {
       '+': () => viewer.dolly(0.9),
       '=': () => viewer.dolly(0.9),
       '-': () => viewer.dolly(1 / 0.9),
       ',': () => viewer.stepView(-1),
       '.': () => viewer.stepView(1),
       c: () => {
-        const now = state.compare === null ? 'off' : state.mode;
-        const next = COMPARISONS[(COMPARISONS.indexOf(now) + 1) % COMPARISONS.length];
-        const other = compared.find(
+        const next = after(COMPARISONS, state.compare === null ? 'off' : state.mode);
+        const other = meta.compared.find(
           name => name !== state.footprint && viewer.renderer.draws(viewer.footprint(name)));
         viewer.change(next === 'off' ? { compare: null } : { compare: state.compare ?? other, mode: next });
       },
-      z: () => viewer.change({ divisor: DIVISORS[(DIVISORS.indexOf(state.divisor) + 1) % DIVISORS.length] }),
+      z: () => viewer.change({ divisor: after(DIVISORS, state.divisor) }),
       r: () => viewer.goToView(viewer.camera.view),
       p: () => viewer.saveScreenshot(),
       f: () => this.toggleFullScreen(),
       h: () => this.toggleFolded(),
       '?': () => element('help').showModal(),
     };
-    actions[key]?.();
-    return key in actions;
   }
 
   /// Direction of the fly keys that are held, or null.
@@ -248,8 +253,8 @@ export class Interface {
     request.catch(() => announce('This browser allows no full screen here.', READING_TIME));
   }
 
-  toggleFolded() {
-    const folded = document.body.classList.toggle('folded');
+  toggleFolded(wanted) {
+    const folded = document.body.classList.toggle('folded', wanted);
     element('fold').setAttribute('aria-expanded', String(!folded));
     element('fold').textContent = folded ? 'Show' : 'Hide';
   }
@@ -280,15 +285,12 @@ export class Interface {
     element('label-right').textContent = comparing ? this.inWords(compare) : '';
     const names = comparing && !isPhotograph ? [footprint, compare] : [footprint], { renderer } = this.viewer;
     const replaced = names.filter(name => !renderer.draws(this.viewer.footprint(name)));
-    element('drawn').textContent = replaced.map(
-      name => `Drawn: ${this.viewer.drawn(name).name}. ${renderer.name} cannot draw ${name}.`).join(' ');
-    element('drawn').hidden = replaced.length === 0;
+    showIfAny('drawn', replaced.map(
+      name => `Drawn: ${this.viewer.drawn(name).name}. ${renderer.name} cannot draw ${name}.`));
     const { view, lens } = this.viewer.camera, has = this.viewer.meta.photographs.includes(view);
     const missing = has ? 'The photograph is seen from its view: R goes there.' : 'This view has no photograph.';
-    const notes = isPhotograph && !besidePhotograph ? [missing] : [];
-    const note = [...(lens.lens ? ['This view is shown without its lens.'] : []), ...notes].join(' ');
-    element('note').textContent = note;
-    element('note').hidden = note === '';
+    const unlike = lens.lens && 'This view is shown without its lens.';
+    showIfAny('note', [unlike, isPhotograph && !besidePhotograph && missing]);
   }
 
   /// A footprint, and what is drawn for it where that is another one.
@@ -298,7 +300,8 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows what was drawn, the names of footprints, with size and times of a frame. `rate` is null where the camera rests; `stages` are milliseconds by name.
+  /// Shows what was drawn, the names of footprints, with size and times of a frame. `rate` is null where the camera
+  /// rests; `stages` are milliseconds by name.
   showFigures(drawn, width, height, milliseconds, rate, stages) {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';

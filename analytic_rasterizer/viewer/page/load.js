@@ -14,11 +14,11 @@ export async function loadMeta() {
 
 /// {meta, geometry, harmonics}; `progress` is called with the part that has been read, from 0 to 1.
 export async function loadScene(meta, progress) {
-  if (meta.compressed) return { meta, ...decompress(meta, await unpack('columns')) };
   if (isExported()) {
-    const geometry = await unpack('geometry');
+    const first = await unpack(meta.compressed ? 'columns' : 'geometry');
     progress(0.5);
-    return sceneOf(meta, geometry, await unpack('harmonics'));
+    await new Promise(resolve => setTimeout(resolve));  // or it would not be seen: to decompress may take seconds
+    return meta.compressed ? { meta, ...decompress(meta, first) } : sceneOf(meta, first, await unpack('harmonics'));
   }
   const responses = await Promise.all([get('geometry.bin'), get('harmonics.bin')]);
   const total = sizeOf(responses[0]) + sizeOf(responses[1]);

@@ -1,5 +1,7 @@
 // WGSL that shows one picture on the canvas, two beside each other, or their difference.
 
+import { bindings } from './frame.wgsl.js';
+
 export const SCREEN_BYTES = 48;
 
 /// Numbers of the struct below.
@@ -20,9 +22,7 @@ export const heatMap = vector => [`color = ${vector}(${HEAT[0]});`, ...HEAT.slic
 /// Pictures hold colour and transmittance.
 export const PRESENT = `
 struct Screen { background: vec3f, divider: f32, canvas: vec2f, difference: f32, unused: f32, size: vec2u }
-@group(0) @binding(0) var<uniform> screen: Screen;
-@group(0) @binding(1) var<storage, read> left: array<vec4f>;
-@group(0) @binding(2) var<storage, read> right: array<vec4f>;
+${bindings('uniform screen: Screen', 'read left: array<vec4f>', 'read right: array<vec4f>')}
 @vertex fn corner(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
   return vec4f(select(-1.0, 3.0, i == 1u), select(-1.0, 3.0, i == 2u), 0.0, 1.0);
 }

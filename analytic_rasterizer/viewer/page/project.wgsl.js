@@ -3,7 +3,7 @@
 import { support } from './bin.wgsl.js';
 import { shaderNumber } from './constants.js';
 import { KINDS } from './footprint.wgsl.js';
-import { FRAME, WORKGROUP } from './frame.wgsl.js';
+import { FRAME, WORKGROUP, bindings } from './frame.wgsl.js';
 import { addHarmonics, sceneBytes } from './sh.js';
 
 // A Gaussian as the page gets it: `read` for its geometry, `number` for its harmonics.
@@ -52,12 +52,9 @@ fn colorOf(i: u32, direction: vec3f) -> vec3f {
 export function project(kind, meta) {
   const form = meta.compact ? compact(meta.compact) : PLAIN;
   return `${FRAME}${KINDS[kind].functions}
-@group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> geometry: array<${form.type}>;
-@group(0) @binding(2) var<storage, read> harmonics: array<u32>;
-@group(0) @binding(3) var<storage, read_write> splats: array<Splat>;
-@group(0) @binding(4) var<storage, read_write> keys: array<u32>;
-@group(0) @binding(5) var<storage, read_write> tiles: array<u32>;
+${bindings(
+  'uniform frame: Frame', `read geometry: array<${form.type}>`, 'read harmonics: array<u32>',
+  'write splats: array<Splat>', 'write keys: array<u32>', 'write tiles: array<u32>')}
 struct Gaussian { mean: vec3f, opacity: f32, scale: vec3f, q: vec4f }  // quaternion w x y z
 ${form.read}${support(kind)}${colorOf(meta, form)}
 // Keeps products from being fused with sums: frame.zero is 0 at run time only. Depths order splats, to the last bit.

@@ -1,16 +1,16 @@
 // WGSL of a stable radix sort of (key, value), 4 bits at a time: histograms of blocks of keys; for each digit a
 // workgroup adds them up over the blocks; scatter. It needs no forward progress of workgroups, and no subgroups.
 
-import { WORKGROUP } from './frame.wgsl.js';
+import { MAIN, WORKGROUP, bindings } from './frame.wgsl.js';
 
 export const SORT_BITS = 4;
 const SORT_ITEMS = 8;                            // keys of a thread
 export const SORT_BLOCK = WORKGROUP * SORT_ITEMS;  // of a workgroup
 
-const SORT = `
+/// What passes have in common, and their bindings from the third on.
+const sort = (...more) => `
 struct Pass { shift: u32, source: u32, first: u32, zero: u32 }  // source: of counts; first: drop keys 0xffffffff
-@group(0) @binding(0) var<uniform> pass_: Pass;
-@group(0) @binding(1) var<storage, read> counts: array<u32>;
+${bindings('uniform pass_: Pass', 'read counts: array<u32>', ...more)}
 fn blocksOf(n: u32) -> u32 { return (n + ${SORT_BLOCK - 1}u) / ${SORT_BLOCK}u; }
 `;
 
@@ -47,12 +47,9 @@ export const scanOf = (array, first) => `
     workgroupBarrier();
   }`;
 
-export const SORT_COUNT = `${SORT}
-@group(0) @binding(2) var<storage, read> keysIn: array<u32>;
-@group(0) @binding(3) var<storage, read_write> histogram: array<u32>;
+export const SORT_COUNT = `${sort('read keysIn: array<u32>', 'write histogram: array<u32>')}
 var<workgroup> bins: array<atomic<u32>, 16>;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+${MAIN}
   let n = counts[pass_.source]; let blocks = blocksOf(n);
   if (t < 16u) { atomicStore(&bins[t], 0u); }
   workgroupBarrier();
@@ -67,31 +64,23 @@ fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: v
   if (t < 16u && block.x < blocks) { histogram[t * blocks + block.x] = atomicLoad(&bins[t]); }
 }`;
 
-export const SORT_SCAN = `${SORT}${GROUP_SCAN}
-@group(0) @binding(2) var<storage, read_write> histogram: array<u32>;
-@group(0) @binding(3) var<storage, read_write> totals: array<u32>;
+export const SORT_SCAN = `${sort('write histogram: array<u32>', 'write totals: array<u32>')}${GROUP_SCAN}
 var<workgroup> sharedBlocks: u32;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) digit: vec3u) {
+${MAIN}
   if (t == 0u) { sharedBlocks = blocksOf(counts[pass_.source]); }
-  let n = workgroupUniformLoad(&sharedBlocks);${scanOf('histogram', 'digit.x * n')}
-  if (t == 0u) { totals[digit.x] = before; }
+  let n = workgroupUniformLoad(&sharedBlocks);${scanOf('histogram', 'block.x * n')}
+  if (t == 0u) { totals[block.x] = before; }
 }`;
 
-export const SORT_SCATTER = `${SORT}
-@group(0) @binding(2) var<storage, read> keysIn: array<u32>;
-@group(0) @binding(3) var<storage, read> valuesIn: array<u32>;
-@group(0) @binding(4) var<storage, read_write> keysOut: array<u32>;
-@group(0) @binding(5) var<storage, read_write> valuesOut: array<u32>;
-@group(0) @binding(6) var<storage, read> histogram: array<u32>;
-@group(0) @binding(7) var<storage, read> totals: array<u32>;
+export const SORT_SCATTER = `${sort(
+  'read keysIn: array<u32>', 'read valuesIn: array<u32>', 'write keysOut: array<u32>', 'write valuesOut: array<u32>',
+  'read histogram: array<u32>', 'read totals: array<u32>')}
 // places[d * WORKGROUP + t]: how many keys of digit d (low half) and d + 8 (high half) thread t has; then, how many come
 // before them in the block.
 var<workgroup> places: array<u32, ${8 * WORKGROUP}>;
 var<workgroup> parts: array<u32, ${WORKGROUP}>;
 var<workgroup> starts: array<u32, 16>;
-@compute @workgroup_size(${WORKGROUP})
-fn main(@builtin(local_invocation_index) t: u32, @builtin(workgroup_id) block: vec3u) {
+${MAIN}
   let n = counts[pass_.source]; let blocks = blocksOf(n);
   for (var d = 0u; d < 8u; d++) { places[d * ${WORKGROUP}u + t] = 0u; }
   if (t < 16u && block.x < blocks) {
