@@ -75,7 +75,7 @@ def texts_of(tree: ast.Module) -> list[tuple[str, bool]]:
             found.append(("".join(parts), id(node) in advice))
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not {id(node)} & (docs | inside):
             found.append((node.value, id(node) in advice))
-    name = re.compile(rf"{OPTION.pattern}(=\{{\}})?")  # alone: an option that is added, or put into another text
+    name = re.compile(r"--[a-z][\w-]*(=\{\})?")  # alone: an option that is added, or put into another text
     return [(text, advised) for text, advised in found if OPTION.search(text) and not name.fullmatch(text)]
 
 
