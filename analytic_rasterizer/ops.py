@@ -40,6 +40,15 @@ class Op:
 _SAMPLES = {footprint["key"]: footprint["samples"] for footprint in _C.footprints()}
 
 
+def _samples(a) -> int:
+    return _SAMPLES.get(a.footprint.partition(_C.RAY_MARK)[0], 1)
+
+
+def _is_along_rays(a) -> bool:
+    """Whether splats are ordered along rays."""
+    return _C.RAY_MARK in a.footprint
+
+
 def _arguments(name: str) -> list[torch.Argument]:
     """The arguments of an op, by its schema."""
     return getattr(torch.ops.analytic_rasterizer, name).default._schema.arguments
@@ -82,6 +91,7 @@ def _lists(like: torch.Tensor, rows: int, a, keep: bool) -> list[torch.Tensor]:
         "splats": like.new_empty(rows, width["splats"]),
         "ids": like.new_empty(rows, **ints),
         "tile_offsets": like.new_empty(tiles + 1, **longs),
+        "rays": like.new_empty(rows, width["rays"]) if _is_along_rays(a) else like.new_empty(0),
     }
     if on_cuda:
         tensors |= {
@@ -102,7 +112,7 @@ def _lists(like: torch.Tensor, rows: int, a, keep: bool) -> list[torch.Tensor]:
 
 def _state(like: torch.Tensor, a) -> list[torch.Tensor]:
     """What `blend` saves for its adjoint: BlendState of csrc/torch/backend.h."""
-    planes = _SAMPLES.get(a.footprint, 1), a.image_height, a.image_width
+    planes = _samples(a), a.image_height, a.image_width
     ints = {"dtype": torch.int32}
     tensors = {"transmittance": like.new_empty(planes), "last": like.new_empty(planes, **ints)}
     if like.device.type == "cuda":
@@ -196,11 +206,12 @@ def _(a):
     splits = [torch.empty(cameras + 1, dtype=torch.int64, device="cpu") for _ in range(2)]
     measured = like.new_empty((*sizes, 3) if a.measured else 0)
     shown = like.new_empty(sizes if a.measured and a.compensated else 0)
+    slopes = like.new_empty((*sizes, 2) if _is_along_rays(a) else 0)
     saved = []
     if a.keep:
         saved = [radii.new_empty(radii.shape if a.table else (cameras, count)), splits[1]]
         saved += [ids[0].new_empty(rows)] if a.values is not None and not a.table else []
-    return *floats, radii, *ids, splits[0], like.new_empty(rows), measured, shown, saved
+    return *floats, radii, *ids, splits[0], like.new_empty(rows), measured, shown, slopes, saved
 
 
 @_register("composite")
@@ -218,7 +229,8 @@ def _(a):
 
 @_register("composite_vjp")
 def _(a):
-    rows = {"means2d": (2,), "cov2d": (3,), "opacities": (), "means2d_abs": (2,), "dets": (), "depths": ()}
+    pairs = dict.fromkeys(("means2d", "means2d_abs", "slopes"), (2,))
+    rows = pairs | {"cov2d": (3,), "opacities": (), "dets": (), "depths": ()}
     for name, rest in rows.items():
         if getattr(a, name) is not None:
             setattr(a, name, getattr(a, name).reshape(-1, *rest))

@@ -70,7 +70,8 @@ class Splats:
     """What one view may show, front to back by the depth of the centres. All tensors float64, a row per splat.
 
     Attributes: mean (N, 2) px, conic (N, 3) of (xx, xy, yy) px^-2, extent (N, 2) px to alpha FAINTEST, opacity (N,),
-    color (N, 3), whiten (N, 3, 3) camera space to units of the Gaussian's axes, centre (N, 3) camera space.
+    color (N, 3), whiten (N, 3, 3) camera space to units of the Gaussian's axes, centre (N, 3) camera space, cov (N, 3)
+    of (xx, xy, yy) px^2, det (N,) px^4, axes (N, 3, 3) in camera space, in columns, scales (N, 3).
     """
 
     def __init__(self, scene: Gaussians, view: io.View):
@@ -87,12 +88,13 @@ class Splats:
         order, ids, self.opacity = order[seen], ids[seen], self.opacity[seen]
         xx, xy, yy = rows.cov2d[order].unbind(1)
         self.mean, self.color = rows.means2d[order], rows.colors[order]
-        self.conic = torch.stack([yy, -xy, xx], 1) / rows.dets[order][:, None]
+        self.cov, self.det = rows.cov2d[order], rows.dets[order]
+        self.conic = torch.stack([yy, -xy, xx], 1) / self.det[:, None]
         level = 2 * torch.log(self.opacity / FAINTEST)
         self.extent = (level[:, None] * torch.stack([xx, yy], 1)).sqrt()
         turn, shift = view.w2c[:3, :3].double(), view.w2c[:3, 3].double()
-        axes = turn @ rotation_matrices(scene.rotations[ids])
-        self.whiten = axes.mT / scene.scales[ids][:, :, None]
+        self.axes, self.scales = turn @ rotation_matrices(scene.rotations[ids]), scene.scales[ids]
+        self.whiten = self.axes.mT / self.scales[:, :, None]
         self.centre = scene.means[ids] @ turn.T + shift
         middle = [n / 2 if c is None else c for c, n in ((view.cx, view.width), (view.cy, view.height))]
         self.focal, self.principal = torch.tensor([[view.fx, view.fy], middle], dtype=torch.float64)

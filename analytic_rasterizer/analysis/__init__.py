@@ -6,6 +6,7 @@ memory.py     whether a picture fits into the memory of a device
 tables.py     tables as text, Markdown and CSV, and figures in which every footprint has its own colour
 pareto.py     accuracy against time of whole pictures
 baking.py     what `bake` gains for a scene
+orders.py     how far pictures in two orders of splats are apart
 affine.py     where the affine picture of a Gaussian is not enough
 planner.py    which effects and which footprint a scene calls for; inspection.py holds what it reports
 """

@@ -12,7 +12,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -29,7 +29,9 @@ from ..footprints import (
 )
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
+from ..render.order import CENTER, RAY
 from . import tables, timing
+from .orders import OrderDifference
 from .reference import RMSE_SHARE, Refined, finite_decibels, image_errors, refine, supersampled
 
 BASE = FASTEST  # times on the CPU are ratios to this
@@ -204,7 +206,16 @@ def _measure(
         front = pareto_front([(row[f"{passes}_ratio"], row["rmse"]) for row in rows])
         for row, on_front in zip(rows, front):
             row[f"{passes}_front"] = on_front
-    return {"reference": reference, "methods": rows}
+    return {"reference": reference, "methods": rows, "order": _order_difference(scene, views, background)}
+
+
+def _order_difference(scene: Gaussians, views: list[View], background) -> dict | None:
+    """How far pictures of BASE in the order of centres, which all methods and the reference have, are from those along
+    rays (`OrderDifference`); None where these cannot be rendered."""
+    if scene.means.is_cuda:
+        return None
+    cases = ([timing.Case(scene, view, BASE, 1, background, order) for order in (CENTER, RAY)] for view in views)
+    return asdict(OrderDifference.of([[case.forward() for case in pair] for pair in cases]))
 
 
 def _describe_reference(refined: Refined, sample: Callable[..., dict]) -> dict:
@@ -333,6 +344,12 @@ def describe(results: dict, at_scale: dict) -> list[str]:
         f"{change['rmse']:.1e}{order}, bias {change['bias']:.0e}, at most {change['max']:.1e}; "
         f"from {second['footprint']} at {second['density']}x{second['density']} it differs by RMSE {second['rmse']:.1e}"
     )
+    if at_scale["order"] is not None:
+        psnr, share = (at_scale["order"][key] for key in ("psnr", "share"))
+        lines.append(
+            f"pictures along rays (render --order {RAY}) are {psnr:.1f} dB from these, in the order of centres; "
+            f"{100 * share:.1f}% of their pixels differ by more than 1/255"
+        )
     unresolved = [row["method"] for row in at_scale["methods"] if not row["resolved"]]
     if unresolved:
         lines.append(
@@ -386,6 +403,9 @@ def _plot(results: dict, at_scale: dict):
         if floor:
             label = "floor of one exact weight"
             ax.axhline(finite_decibels(floor**2), color="black", linewidth=0.9, linestyle=":", label=label)
+        if at_scale["order"] is not None:
+            label = "pictures in the order along rays"
+            ax.axhline(at_scale["order"]["psnr"], color="#868e96", linewidth=0.9, linestyle="--", label=label)
         limit, top = finite_decibels(at_scale["reference"]["resolves_rmse_from"] ** 2), ax.get_ylim()[1]
         if limit < top:
             ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")

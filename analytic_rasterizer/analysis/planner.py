@@ -21,14 +21,17 @@ from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from ..footprints import sampled_footprints
 from ..gaussians import Gaussians
 from ..render.effects import NEAR, Effects
+from ..render.order import CENTER, RAY
 from ..render.outputs import depths
 from ..render.rasterizer import GaussianRasterizer
+from ..render.seam import has_seam
 from ..render.settings import GaussianRasterizationSettings
 from ..render.stages import Splats, Stages, project, render_stages
 from ..sh import needed_sh_degree, sh_band_bounds
 from . import timing
 from .affine import LIMIT, bends
 from .inspection import BINS, NARROW, Candidate, EffectFinding, SceneReport, ViewReport, in_255, percent, share
+from .orders import OrderDifference
 
 LADDER = sampled_footprints()  # what is tried
 BASE, REFERENCE = LADDER[0], LADDER[-1]  # the cheapest, and what the others are compared with
@@ -129,11 +132,13 @@ def inspect_scene(
         reports.append(_view_report(scene, chosen, i, name, camera, seen[i], rms[footprint][i]))
     progress("time effects")
     costs = _effect_costs(scene, timed, footprint, chosen.effects, shown, rounds)
+    orders = _order_difference(scene, cameras, chosen.effects)
     findings = (
         _footprint_finding(candidates, footprint, reports),
         _sh_finding(scene, chosen, top_band, costs.get("sh")),
         _filter_finding(chosen, costs.get("filter_3d")),
         _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
+        _order_finding(orders, tolerance, costs.get("order")),
         _affine_finding(scene, cameras, seen, [report.name for report in reports]),
         *_other_findings(chosen, costs["outputs"]),
     )
@@ -267,6 +272,9 @@ def _effect_costs(scene: Gaussians, cameras, footprint, effects: Effects, shown,
     if effects.filter_3d is not None:
         cases["no filter"] = (scene, footprint, replace(effects, filter_3d=None))
         with_and_without["filter_3d"] = ("plain", "no filter")
+    if _has_rays(cameras[0]):
+        cases["rays"], cases["centers"] = ((scene, BASE, replace(effects, order=o)) for o in (RAY, CENTER))
+        with_and_without["order"] = ("rays", "centers")
     seconds = _seconds(cases, cameras, rounds)
     return {name: seconds[on] / seconds[off] for name, (on, off) in with_and_without.items()}
 
@@ -318,6 +326,32 @@ def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float)
         "is that of rendering them too, and other views may show them"
     )
     return EffectFinding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
+
+
+def _has_rays(camera: GaussianRasterizationSettings) -> bool:
+    """Whether a view can be rendered in the order along rays."""
+    return camera.viewmatrix.device.type == "cpu" and not has_seam(camera)
+
+
+def _order_difference(scene: Gaussians, cameras: list, effects: Effects) -> OrderDifference | None:
+    """How far BASE in the order of centres is from BASE along rays; None where that cannot be rendered."""
+    if not all(_has_rays(camera) for camera in cameras):
+        return None
+    in_orders = [replace(effects, order=order) for order in (CENTER, RAY)]
+    return OrderDifference.of([[_stages(scene, camera, BASE, e).color for e in in_orders] for camera in cameras])
+
+
+def _order_finding(found: OrderDifference | None, tolerance: float, cost: float | None) -> EffectFinding:
+    if found is None:
+        reason = "not examined: the order along rays is for the CPU, and for other pictures than equirectangular ones"
+        return EffectFinding("order", None, None, None, None, CENTER, reason)
+    needed = found.rms > tolerance
+    reason = (
+        f"pictures in the order of centres are {found.psnr:.1f} dB from those along rays ({BASE}), and "
+        f"{percent(found.share)} of their pixels differ by more than 1/255; what differs pops when the camera moves"
+    )
+    advice = f"render --order {RAY}" if needed else CENTER
+    return EffectFinding("order", needed, found.rms, "measured", cost, advice, reason)
 
 
 def _affine_finding(scene: Gaussians, cameras: list, seen: list[torch.Tensor], names: list[str]) -> EffectFinding:

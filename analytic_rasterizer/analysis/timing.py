@@ -18,7 +18,9 @@ import torch
 from .. import _C
 from ..cameras.camera import View
 from ..gaussians import Gaussians
+from ..render.order import CENTER
 from ..render.rasterizer import GaussianRasterizer
+from ..render.settings import in_order
 
 ROUNDS = {"cpu": 5, "cuda": 20}
 SLOW = 20  # calls that take so many times as long as the base are timed only twice on the CPU
@@ -29,18 +31,25 @@ WARM_UP = 40  # calls before timing on CUDA: the first 32 frames of a size wait 
 
 
 class Case:
-    """One view of a scene, ready to render with one footprint.
+    """One view of a scene, ready to render with one footprint, in an `Effects.order`.
 
     With `supersampling` n the whole picture is rendered n times larger and averaged over n x n pixels: the
     footprint is evaluated in the pixels of the larger picture.
     """
 
     def __init__(
-        self, scene: Gaussians, view: View, footprint: str, supersampling: int = 1, background=(0.0, 0.0, 0.0)
+        self,
+        scene: Gaussians,
+        view: View,
+        footprint: str,
+        supersampling: int = 1,
+        background=(0.0, 0.0, 0.0),
+        order: str = CENTER,
     ):
         device = scene.means.device
         self.supersampling = supersampling
-        self.settings = view.settings(supersampling, background, scene.sh_degree, footprint, device=device)
+        settings = view.settings(supersampling, background, scene.sh_degree, footprint, device=device)
+        self.settings = in_order(settings, order)
         self.rasterizer = GaussianRasterizer(self.settings)
         self.gaussians = scene.arguments()
         self.inputs = {k: v.detach().requires_grad_() for k, v in self.gaussians.items()}

@@ -20,6 +20,7 @@ from .. import _C
 from ..filters import PIXEL_VARIANCE
 from ..io.errors import SceneError, SceneWarning
 from ..io.images import BACKGROUNDS
+from ..render.order import ORDERS
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.files import results_folder
 from .launch import report
@@ -216,6 +217,12 @@ def add_footprint(
 ) -> None:
     """--footprint, and where it comes from otherwise."""
     parser.add_argument("--footprint", metavar="NAME[:k=v,..]", help=f"{text} {default}")
+
+
+def add_order(parser) -> None:
+    """--order, and where it comes from otherwise."""
+    text = "order of splats: center, by the depth of their centres; ray or ray:32, along the rays of pixels"
+    parser.add_argument("--order", choices=ORDERS, help=f"{text} (default: that of the training, else {ORDERS[0]})")
 
 
 def add_reading(parser, folder: str, training: str = "") -> None:

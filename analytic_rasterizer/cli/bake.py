@@ -69,7 +69,7 @@ def run(args) -> None:
     say(f"trained with {trained.footprint}: {trained.reason}")
     gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
     scales, opacities = bake_dilation(*gaussians, cameras, args.dilation or trained.footprint.option)
-    metadata = io.SceneMetadata(footprint=RECOMMENDED, offset=found.metadata.offset)
+    metadata = io.SceneMetadata(footprint=RECOMMENDED, offset=found.metadata.offset, order=found.metadata.order)
     io.save_scene(args.out, scene.with_activated(scales, opacities), metadata)
     reason = f" ({found.size_reason})" if not given and found.size_reason else ""
     pictures = f"{len(views)} pictures of {sizes_in_words(views)}{reason}"

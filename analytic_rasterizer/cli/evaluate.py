@@ -32,6 +32,7 @@ from ..training.start import background_of
 from ..training.store import processes_here
 from .arguments import (
     add_machine_options,
+    add_order,
     add_reading,
     add_scales,
     check_writable_file,
@@ -43,7 +44,7 @@ from .arguments import (
     writable_folder,
 )
 from .launch import add_rank_options, ranks_of
-from .scenes import color_in_words, say
+from .scenes import color_in_words, order_in_words, say
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
 HEADINGS[COLOR_CORRECTED] = ("PSNR, best affine colour", "{:.2f}")  # of each picture
@@ -66,6 +67,7 @@ def add_parser(subcommands) -> None:
     out = "folder for the results (default: SCENE where it is a folder, otherwise NAME_evaluation beside it)"
     add("--out", metavar="DIR", help=out)
     add("--footprint", nargs="+", dest="footprints", metavar="NAME[:k=v]", help="(default: that of the training)")
+    add_order(parser)
     add_scales(parser, whole_numbers, "reductions to test at: 2 is half the size (default: those trained at, or 1)")
     background = "behind pictures with alpha: black, white or R,G,B (default: that of the training, or of the capture)"
     add("--background", type=color, metavar="COLOR", help=background)
@@ -141,6 +143,7 @@ def run_on(ranks: Ranks, args) -> None:
     options = protocol.options or TrainingOptions()
     check_scales(protocol.scales)  # raises before the capture is read
     choices = [found.choose_footprint(name) for name in args.footprints or [None]]
+    orders = {str(c.footprint): found.choose_order(c.footprint, args.order) for c in choices}
     offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
     capture = protocol.source.load(offset=offset)
     if not capture.test:
@@ -155,7 +158,7 @@ def run_on(ranks: Ranks, args) -> None:
     pictures = load_pictures(capture.test, protocol.scales, background, args.device, options.downsampling, memory)
     said = [] if protocol.options else differences(found, protocol, capture, background)
     chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
-    tell(*capture.notes, *said, *chosen)
+    tell(*capture.notes, *said, *chosen, *dict.fromkeys(line for of in orders.values() for line in order_in_words(of)))
     lpips = None
     if args.lpips != "none":
         try:
@@ -166,15 +169,17 @@ def run_on(ranks: Ranks, args) -> None:
     pictures_folder = writable_folder(out / EVALUATION)
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
-    for footprint in dict.fromkeys(str(choice.footprint) for choice in choices):
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common, color_corrected=True)
+    for footprint, order in orders.items():
+        settings = common | {"order": order.order}
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **settings, color_corrected=True)
         if args.pictures > 0:
-            save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
+            save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **settings)
     if ranks.is_first:
         views = [view.name for view in pictures.views]
         written = {"scene": str(found.path), "data": str(protocol.source.folder), "views": views}
         written["resampled"] = sum(item.undistort for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
+        written["order"] = {footprint: order.order for footprint, order in orders.items()}
         write_json(out / f"{EVALUATION}.json", written)
         if args.plot is not None:
             save_plots(args.plot, evaluation_plots(results, views))

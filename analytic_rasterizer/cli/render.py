@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,14 @@ from ..cameras.up import level_up
 from ..footprints import FOOTPRINTS, Footprint, resolve_footprint
 from ..gaussians import Gaussians
 from ..render.effects import Effects
+from ..render.order import CENTER
 from ..render.outputs import normalized
 from ..render.rasterizer import GaussianRasterizer
 from ..viewer.packing import extent
 from .arguments import (
     LARGER,
     add_footprint,
+    add_order,
     add_scales,
     add_scene,
     check_writable_file,
@@ -32,7 +35,7 @@ from .arguments import (
     use_machine,
     writable_folder,
 )
-from .scenes import say, settle_views, sizes_in_words
+from .scenes import order_in_words, say, settle_views, sizes_in_words
 
 STAGES = ("project", "list_tiles", "blend")
 FILM = ".mp4"
@@ -55,6 +58,7 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("--out", required=True, metavar="OUT", help="folder for the pictures, or FILE.mp4 for a film (extra 'video')")
     add_footprint(parser)
+    add_order(parser)
     samples = "of --footprint: samples of a pixel, 1, 4 or 16 of box and moment"
     add("--samples", type=int, metavar="N", help=samples)
     path = "orbit: a circle around the scene; views: a smooth path through the views, in their order"
@@ -76,6 +80,7 @@ def run(args) -> None:
     use_machine(args)
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)
+    order = found.choose_order(choice.footprint, args.order)
     if args.alpha:
         args.background = io.BLACK  # whose picture is that without a background
     views, said = settle_views(args, found)
@@ -87,8 +92,9 @@ def run(args) -> None:
     scene = io.load_scene(found.path).to(args.device)
     if args.path is not None:
         views = path_of(args, scene, views)
-    say(*said, f"footprint {choice.footprint}: {choice.reason}", size_in_words(views, args.scales))
-    renderer = Renderer(scene, choice.footprint, args.background, args.device)
+    said += [f"footprint {choice.footprint}: {choice.reason}", *order_in_words(order)]
+    say(*said, size_in_words(views, args.scales))
+    renderer = Renderer(scene, choice.footprint, args.background, args.device, order.order)
     if film:
         save_film(args, renderer, [view.scaled(1 / args.scales[0]) for view in views])
         return
@@ -151,15 +157,16 @@ def path_of(args, scene: Gaussians, views: list[io.View]) -> list[io.View]:
 
 
 class Renderer:
-    """Renders views of a scene with one footprint."""
+    """Renders views of a scene with one footprint, in one order."""
 
-    def __init__(self, scene: Gaussians, footprint: Footprint, background, device: str):
+    def __init__(self, scene: Gaussians, footprint: Footprint, background, device: str, order: str = CENTER):
         self.scene, self.footprint, self.background, self.device = scene, footprint, background, device
+        self.effects = Effects(order=order)
         self.gaussians = scene.arguments()
 
-    def settings(self, view: io.View, **options):
-        degree = self.scene.sh_degree
-        return view.settings(1, self.background, degree, self.footprint, device=self.device, **options)
+    def settings(self, view: io.View, **outputs):
+        degree, effects = self.scene.sh_degree, replace(self.effects, **outputs)
+        return view.settings(1, self.background, degree, self.footprint, device=self.device, effects=effects)
 
     def pictures(self, views: list[io.View]) -> Iterator[tuple[io.View, torch.Tensor, list]]:
         """Each view, its colours (3, H, W), and its row of the table."""
@@ -173,7 +180,7 @@ class Renderer:
     @torch.no_grad()
     def outputs(self, view: io.View):
         """The `Outputs` alpha and depth of a view."""
-        settings = self.settings(view, effects=Effects(alpha=True, depth=True))
+        settings = self.settings(view, alpha=True, depth=True)
         return GaussianRasterizer(settings)(means2D=None, **self.gaussians)[2]
 
 

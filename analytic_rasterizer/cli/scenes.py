@@ -6,6 +6,8 @@ import sys
 
 from .. import io
 from ..io import FoundScene, View
+from ..io.appearance import OrderChoice
+from ..render.order import CENTER
 
 
 def say(*lines: str) -> None:
@@ -40,6 +42,11 @@ def settle_views(args, found: FoundScene, required: bool = True) -> tuple[list[V
     if str(found.path) != args.scene:
         said.insert(0, str(found.path))
     return views, [f"from {args.scene}: {'; '.join(said)}"] if said else []
+
+
+def order_in_words(choice: OrderChoice) -> list[str]:
+    """Why splats are in this order, in a line; none for the usual one."""
+    return [] if choice.order == CENTER else [f"order {choice.order}: {choice.reason}"]
 
 
 def sizes_in_words(views: list[View]) -> str:

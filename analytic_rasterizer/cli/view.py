@@ -7,10 +7,12 @@ from pathlib import Path
 
 from .. import io, viewer
 from ..footprints import resolve_footprint
+from ..render.order import CENTER
 from .arguments import (
     add_files,
     add_footprint,
     add_machine_options,
+    add_order,
     add_view_options,
     check_writable_file,
     port,
@@ -18,7 +20,7 @@ from .arguments import (
     use_machine,
 )
 from .photographs import find_photographs
-from .scenes import say, settle_views
+from .scenes import order_in_words, say, settle_views
 
 
 def add_parser(subcommands) -> None:
@@ -32,6 +34,7 @@ def add_parser(subcommands) -> None:
     )
     add_files(parser, "cameras to jump to")
     add_footprint(parser, "what the page starts with")
+    add_order(parser)
     parser.add_argument("--port", type=port, metavar="N", help="port to serve on (default: any free one)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
     parser.add_argument(
@@ -61,6 +64,8 @@ def run(args) -> None:
         return
     if args.threads is not None or args.device is not None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
+    if args.order not in (None, CENTER):
+        raise ValueError(f"--order {args.order} is for --server: the browser draws in the order of {CENTER}")
     if args.export is not None and Path(args.export).suffix.lower() != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
     if args.export is not None:
@@ -108,6 +113,8 @@ def pack(args, found: io.FoundScene, views: list[io.View], background) -> tuple[
     if footprint != choice.footprint:
         reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
     options = {"footprint": footprint, "background": background, "name": found.path.name, "compact": args.compact}
+    if found.metadata.order not in (None, CENTER):
+        reason += f"; {found.path.name} was trained in order {found.metadata.order}, which --server shows"
     return viewer.pack_scene(io.load_scene(found.path), views, **options), f"footprint {footprint}: {reason}"
 
 
@@ -122,14 +129,15 @@ def run_live(args) -> None:
     given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)
+    order = found.choose_order(choice.footprint, args.order)
     use_machine(args)
     io.optional_import("viser", "view")  # raises before the scene is read
     views, said = settle_views(args, found, required=False)
     scene = io.load_scene(found.path)
-    options = {"views": views, "footprint": choice.footprint, "background": args.background}
+    options = {"views": views, "footprint": choice.footprint, "background": args.background, "order": order.order}
     with viewer.LiveViewer(args.port or 0, name=found.path.name, **options) as live:
         live.update(scene.to(args.device), copy=False)
-        say(*said, f"footprint {choice.footprint}: {choice.reason}")
+        say(*said, f"footprint {choice.footprint}: {choice.reason}", *order_in_words(order))
         announce(args, len(scene.means), live.footprint, live.url)
         try:
             live.wait()

@@ -22,6 +22,7 @@ from ..footprints import (
     chosen_footprint,
     resolve_footprint,
 )
+from ..render.order import CENTER, can_be_in, check_order, key_of
 from . import ply
 from .errors import SceneError
 from .images import BLACK, WHITE
@@ -45,6 +46,14 @@ class Choice:
     """
 
     footprint: Footprint
+    reason: str
+
+
+@dataclass(frozen=True)
+class OrderChoice:
+    """An `Effects.order`, and why it was chosen, as in `Choice`."""
+
+    order: str
     reason: str
 
 
@@ -188,6 +197,21 @@ class FoundScene:
         if given is None and chosen is not None:
             choice = Choice(chosen, f"{ENVIRONMENT_VARIABLE} says so")
         return Choice(choice.footprint, choice.reason + self._bake_hint(choice.footprint))
+
+    def choose_order(self, footprint: Footprint, given: str | None = None) -> OrderChoice:
+        """In which order to show the scene with a footprint: `given`, else that of its training where the footprint can
+        have it, else "center".
+
+        Raises ValueError where `given` is no order, or none of this footprint.
+        """
+        if given is not None:
+            check_order(given)
+            key_of(footprint, given)
+            return OrderChoice(given, "as given")
+        own = self.metadata.order
+        if own is None or not can_be_in(footprint, own):
+            return OrderChoice(CENTER, "the usual one")
+        return OrderChoice(own, f"{self.path.name} says so")
 
     def _bake_hint(self, footprint: Footprint) -> str:
         """What to do about a scene that was trained with `point`; "" for others."""

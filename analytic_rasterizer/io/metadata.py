@@ -1,4 +1,4 @@
-"""Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
+"""Metadata of scenes: for which footprint and order a scene was made, and the offset of its positions.
 
 A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json (extras), a glTF in
 its asset.extras, a USD in its customLayerData. A .splat holds none.
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..footprints import COMPENSATED, DILATED, resolve_footprint
+from ..render.order import CENTER, check_order
 from . import gltf, ply, sog, spz, usd
 from .axes import axes_in, axes_of_format, checked_axes
 from .errors import first_line
@@ -35,6 +36,7 @@ class SceneMetadata:
         offset: (x, y, z), world units. Positions in the world are those that `load_scene` returns plus this.
         comments: Other lines of text.
         background: (r, g, b) in [0, 1], the colour that the scene is to be seen in front of.
+        order: The `Effects.order` that the scene was trained with. "center" is not written.
     """
 
     footprint: str | None = None
@@ -42,13 +44,14 @@ class SceneMetadata:
     offset: tuple[float, float, float] | None = None
     comments: tuple[str, ...] = ()
     background: tuple[float, float, float] | None = None
+    order: str | None = None
 
     def checked(self) -> SceneMetadata:
         """The same as it is written: the footprint with all of its options, and `antialiased` as that footprint is.
 
         Raises:
-            ValueError: An unknown footprint, an offset that is not three finite numbers, a background that is not
-                three numbers from 0 to 1, or comments that are not single lines of ASCII.
+            ValueError: An unknown footprint or order, an offset that is not three finite numbers, a background that is
+                not three numbers from 0 to 1, or comments that are not single lines of ASCII.
         """
         found = replace(self, comments=tuple(self.comments))
         for comment in found.comments:
@@ -64,6 +67,8 @@ class SceneMetadata:
             if len(background) != 3 or not all(0 <= value <= 1 for value in background):
                 raise ValueError(f"background must be three numbers from 0 to 1, got {self.background}")
             found = replace(found, background=background)
+        if found.order is not None:
+            check_order(found.order)
         if found.footprint is not None:
             footprint = resolve_footprint(found.footprint)
             found = replace(found, footprint=str(footprint), antialiased=footprint.name != DILATED)
@@ -74,6 +79,8 @@ class SceneMetadata:
         lines = [ANTIALIASED] if self.antialiased else []
         if self.footprint is not None:
             lines.append(f"{OWN} footprint {self.footprint}")
+        if self.order not in (None, CENTER):
+            lines.append(f"{OWN} order {self.order}")
         if self.offset is not None:
             lines.append(f"{OWN} offset {' '.join(repr(value) for value in self.offset)}")
         if self.background is not None:
@@ -86,6 +93,8 @@ class SceneMetadata:
         if self.antialiased:
             chosen = self.footprint or COMPENSATED
             lost.append(f"the footprint (`render --footprint {chosen}` shows it)")
+        if self.order not in (None, CENTER):
+            lost.append(f"the order (`render --order {self.order}` shows it)")
         if self.offset is not None and any(self.offset):
             lost.append(f"the offset {self.offset} of its positions")
         if self.background is not None:
@@ -103,13 +112,13 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
             fields["antialiased"] = words[1] == "mip"
         elif words in (["antialiased", "0"], ["antialiased", "1"]):  # Postshot
             fields["antialiased"] = words[1] == "1"
-        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"], ["background"], ["axes"]):
+        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["order"], ["offset"], ["background"], ["axes"]):
             _, name, *values = words
             try:
                 if name == "axes":  # of the file, and not of the scene
                     checked_axes(" ".join(values))
                     continue
-                value = " ".join(values) if name == "footprint" else tuple(map(float, values))
+                value = " ".join(values) if name in ("footprint", "order") else tuple(map(float, values))
                 fields[name] = getattr(SceneMetadata(**{name: value}).checked(), name)
             except (ValueError, TypeError) as error:
                 warnings.warn(f"{where}: '{line}' is not understood ({first_line(error)})", stacklevel=3)

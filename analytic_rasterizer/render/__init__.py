@@ -2,7 +2,7 @@
 
 | module | contains |
 |---|---|
-| `settings`, `effects` | how to render |
+| `settings`, `effects`, `order` | how to render |
 | `rasterizer` | `GaussianRasterizer`; the function `render`, in which every rendering ends |
 | `arguments`, `autocast` | from what users give to the arguments of the operators |
 | `stages` | `project`, `list_tiles` and `blend`, each on its own |

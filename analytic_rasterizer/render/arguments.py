@@ -15,6 +15,7 @@ from ..ops import Op
 from ..sh import used_sh_degree
 from .autocast import widened
 from .effects import MAX_SH_DEGREE, Effects
+from .order import key_of
 from .seam import has_seam
 from .settings import GaussianRasterizationSettings, check_settings
 
@@ -110,7 +111,7 @@ def camera_arguments(
         "tanfovy": one_number("tanfovy", tanfovy),
         "scale_modifier": one_number("scale_modifier", s.scale_modifier),
         "sh_degree": degree,
-        "footprint": footprint.key,
+        "footprint": key_of(footprint, effects.order),
         "option": footprint.option,
     }
 

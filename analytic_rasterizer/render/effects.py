@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import torch
 
 from .. import _C
-from ..cameras.lens import Lens
+from ..cameras.lens import SPHERE, Lens
 from ..checks import check_number
+from .order import CENTER, check_order
 
 MAX_SH_DEGREE = _C.MAX_SH_DEGREE
 NEAR = _C.NEAR  # camera-space z up to which everything is culled
@@ -180,6 +181,10 @@ class Effects:
         defocus: `Defocus`, or None for a pinhole.
         motion: `Motion`, or None for an instant.
         sh_degree: Highest degree of spherical harmonics to use, 0 to 4; None: that of the settings.
+        order: In which order a pixel composites splats: "center", by the depth of their centres; "ray", by the depth at
+            which its ray is densest in them, so that nothing pops when the camera moves; "ray:32", the same nearer to
+            the exact order (`ORDERS`). With the last two at most 4 channels are blended, not every footprint can be
+            used, and medians, dominant Gaussians and statistics cannot be made. The CPU only.
 
     Raises:
         TypeError: A wrong type.
@@ -202,6 +207,7 @@ class Effects:
     motion: Motion | None = None
     sh_degree: int | None = None
     lens: Lens | None = None
+    order: str = CENTER
 
     __eq__ = _equal
 
@@ -215,6 +221,7 @@ class Effects:
                 raise TypeError(f"{name} must be a {kind.__name__} or None, got {value!r}")
         if self.lens is not None and self.orthographic:
             raise ValueError("lens must be None for an orthographic camera")
+        self._check_order()
         degree = self.sh_degree
         if isinstance(degree, bool) or not (degree is None or isinstance(degree, Integral)):
             raise TypeError(f"sh_degree must be a whole number or None, got {degree!r}")
@@ -225,6 +232,17 @@ class Effects:
             check_number("far", self.far)
         if not self.far > self.near:
             raise ValueError(f"far must be above near, {self.near}, got {self.far}")
+
+    def _check_order(self) -> None:
+        """Raises ValueError for an order that there is not, or that does not go with the rest."""
+        check_order(self.order)
+        if self.order == CENTER:
+            return
+        for name in ("median_depth", "dominant_index", "gaussian_stats"):
+            if getattr(self, name):
+                raise ValueError(f"{name} must be False with order {self.order!r}, got True")
+        if self.lens is not None and self.lens.model == SPHERE:
+            raise ValueError(f"lens must not be {SPHERE} with order {self.order!r}")
 
     @property
     def has_outputs(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -137,6 +138,12 @@ class GaussianRasterizationSettings(_Fields):
         fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
         effects = "" if self.effects is None else f", effects={self.effects}"
         return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r}{effects})"
+
+
+def in_order(settings: GaussianRasterizationSettings, order: str) -> GaussianRasterizationSettings:
+    """The settings with one of `ORDERS` among their effects, and the other effects as they are."""
+    effects = settings.effects if isinstance(settings.effects, Effects) else Effects()
+    return settings if order == effects.order else settings._replace(effects=replace(effects, order=order))
 
 
 def check_settings(settings: Any) -> None:

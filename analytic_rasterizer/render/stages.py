@@ -50,7 +50,9 @@ class Splats:
         row_splits: (C + 1,) int64 on the CPU: the rows of camera c are row_splits[c] to row_splits[c + 1].
         dets: (N,) determinants of cov2d, px^4, which would cancel if they were computed from its entries.
         width, height: Size of the images, px.
-        footprint, option: Key and number of the footprint, see `Footprint`.
+        footprint, option: Key and number of the footprint, see `Footprint`. The key says the order too.
+        slopes: (N, 2) by how much the depth at which a ray meets the splat grows per px, world units; None unless the
+            order is along rays (`Effects.order`).
     """
 
     means2d: torch.Tensor
@@ -67,6 +69,7 @@ class Splats:
     height: int
     footprint: str
     option: float
+    slopes: torch.Tensor | None = None
 
     @property
     def cameras(self) -> int:
@@ -93,6 +96,7 @@ class Splats:
             self.colors.split(sizes) if len(self.colors) == len(self.means2d) else [self.colors] * len(sizes)
         )
         rows["camera_ids"] = [torch.zeros_like(ids) for ids in rows["camera_ids"]]
+        rows["slopes"] = [None] * len(sizes) if self.slopes is None else self.slopes.split(sizes)
         rows["row_splits"] = [torch.tensor([0, size], device="cpu") for size in sizes]
         return [replace(self, **dict(zip(rows, of_camera))) for of_camera in zip(*rows.values())]
 
@@ -189,11 +193,13 @@ def project_once(
     """As `project`, with one row for a Gaussian in a camera, and what `turns_of` returns."""
     gaussians, batch = project_arguments(cameras, means3D, opacities, **optional)
     turns = turns_of(cameras, means3D)
-    rows = dict(zip(ROWS, _project(**gaussians, **batch)))
+    made = dict(zip(_project.results, _project(**gaussians, **batch)))
+    rows = dict(zip(ROWS, made.values()))
+    slopes = made["slopes"] if _C.RAY_MARK in batch["footprint"] else None
     if not rows["colors"].shape[1]:
         rows["colors"] = rows["colors"].new_empty(0, 3)
     size = {"width": batch["image_width"], "height": batch["image_height"]}
-    return Splats(**rows, **size, footprint=batch["footprint"], option=batch["option"]), turns
+    return Splats(**rows, **size, footprint=batch["footprint"], option=batch["option"], slopes=slopes), turns
 
 
 def project_arguments(
@@ -259,6 +265,7 @@ def list_tiles(splats: Splats, *, keep: bool = True) -> TileLists:
         depths=s.depths.detach(),
         row_splits=s.row_splits,
         keep=keep,
+        slopes=s.slopes,
         **s.size,
     )
     return TileLists(tuple(tensors), s.cameras)

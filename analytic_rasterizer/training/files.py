@@ -73,9 +73,16 @@ class Log:
                 self.begin()
 
 
-def write_scene(path: Path, scene: Gaussians, footprint: str, offset: tuple[float, float, float] | None = None) -> None:
-    """The scene in a file that says for which footprint it is, and what positions are relative to, see `View`."""
-    io.save_scene(path, scene, io.SceneMetadata(footprint=footprint, offset=offset))
+def write_scene(
+    path: Path,
+    scene: Gaussians,
+    footprint: str,
+    offset: tuple[float, float, float] | None = None,
+    order: str | None = None,
+) -> None:
+    """The scene in a file that says for which footprint and order it is, and what positions are relative to, see
+    `View`."""
+    io.save_scene(path, scene, io.SceneMetadata(footprint=footprint, offset=offset, order=order))
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:

@@ -130,9 +130,10 @@ def _any_shown(trainer: Trainer, image: Tensor) -> bool:
     if bool((image != image[:, :1, :1]).any()):
         return True
     arguments = trainer.scene().arguments()
-    settings = trainer.pictures.resolve(footprint=trainer.options.footprint, sh_degree=0)[min(trainer.options.scales)]
+    options = trainer.options
+    of_scales = trainer.pictures.resolve(options.order, footprint=options.footprint, sh_degree=0)
     arguments["shs"] = arguments["shs"][:, :1]
-    return any(bool((render(arguments, of_view)[1] > 0).any()) for of_view in settings)
+    return any(bool((render(arguments, of_view)[1] > 0).any()) for of_view in of_scales[min(options.scales)])
 
 
 def check_left(trainer: Trainer, before: int) -> None:

@@ -180,6 +180,7 @@ class TrainingOptions:
     sh_every: int = SceneOptions.sh_every
     background: str = PictureOptions.background
     filter_3d: bool = SceneOptions.filter_3d
+    order: str = SceneOptions.order
     effects: str = PictureOptions.effects
     exposure: str = PictureOptions.exposure
     seed: int = LengthOptions.seed

@@ -13,6 +13,7 @@ from ..declared import NOT_NEGATIVE, POSITIVE, SHARE, Options, Range, at_least, 
 from ..density import GradientOptions
 from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.images import BACKGROUNDS
+from ..render.order import CENTER, ORDERS, key_of
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 EFFECTS = ("auto", "none")
@@ -92,6 +93,14 @@ class SceneOptions(Options):
     sh_every: int = option(
         1000, "Steps between two degrees, at most; never more than a tenth of the training.", at_least(1)
     )
+    order: str = option(
+        CENTER,
+        'Order of splats: "center", by the depth of their centres; or along the rays of pixels, so that nothing pops '
+        'when the camera moves: "ray", or "ray:32", which is nearer to the exact order. The last two take several '
+        "times as long, and run on the CPU only.",
+        one_of(ORDERS),
+        main=True,
+    )
     filter_3d: bool = option(False, "Whether Gaussians are widened by the 3D filter of Mip-Splatting.", main=True)
 
     def __post_init__(self):
@@ -99,6 +108,8 @@ class SceneOptions(Options):
         if self.first_footprint not in ("", NO_FOOTPRINT):
             object.__setattr__(self, "first_footprint", str(resolve_footprint(str(self.first_footprint))))
         super().__post_init__()
+        for name in {self.footprint, self.first_footprint} - {"", NO_FOOTPRINT}:
+            key_of(resolve_footprint(name), self.order)  # raises for what cannot be combined
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from torch.nn import functional
 
 from .. import io
 from ..io.errors import SceneWarning, counted_files, naming
-from ..render.settings import GaussianRasterizationSettings
+from ..render.order import CENTER
+from ..render.settings import GaussianRasterizationSettings, in_order
 from .captures import Photograph
 from .parts import check_scales
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size, unreadable_pictures
@@ -88,9 +89,12 @@ class Pictures(NamedTuple):
     def _color(self, scale: int, view: int) -> Tensor:
         return self._on_device(self.colors[scale][view], scale, view)
 
-    def resolve(self, **options) -> dict[int, list[GaussianRasterizationSettings]]:
-        """The settings with other options, such as `footprint` and `sh_degree`."""
-        return {scale: [s._replace(**options) for s in of_scale] for scale, of_scale in self.settings.items()}
+    def resolve(self, order: str = CENTER, **options) -> dict[int, list[GaussianRasterizationSettings]]:
+        """The settings with an `Effects.order`, and with other options, such as `footprint` and `sh_degree`."""
+        return {
+            scale: [in_order(s, order)._replace(**options) for s in of_scale]
+            for scale, of_scale in self.settings.items()
+        }
 
 
 def load_pictures(

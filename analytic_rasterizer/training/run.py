@@ -308,7 +308,7 @@ class Run:
         with self._phase("write"):
             scene = self._whole(self.trainer.scene(), SCENE)
             if self.ranks.is_first:
-                write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
+                write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset, self.options.order)
                 if self.trainer.exposures is not None:
                     names = [view.name for view in self.trainer.pictures.views]
                     write_json(self.out / EXPOSURES, dict(zip(names, self.trainer.exposures.matrices.tolist())))
@@ -348,7 +348,7 @@ class Run:
         baked = self._whole(scene.with_activated(scales, opacities), MIP_SCENE)
         if self.ranks.is_first:
             # Its pixels are in the Gaussians.
-            write_scene(self.out / MIP_SCENE, baked, UNFILTERED, self.capture.offset)
+            write_scene(self.out / MIP_SCENE, baked, UNFILTERED, self.capture.offset, self.options.order)
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -367,6 +367,7 @@ class Run:
             port,
             views=self.trainer.pictures.views,
             footprint=self.options.footprint,
+            order=self.options.order,
             background=background_of(self.options, self.capture.background) or self.capture.background,
             name=Path(self.source["scene"]).name,
         )
@@ -420,6 +421,7 @@ class Run:
                 memory = self.memory.less(self.trainer.pictures.store.plan, self.device)
                 pictures = self._load(self.capture.test, background, memory)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks, "color_corrected": True}
+                common |= {"order": self.options.order}
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
         metrics["phases"] = self.ranks.from_first(phases)

@@ -330,7 +330,7 @@ class Trainer:
         if self._resolved is None or self._resolved[0] != due:
             if self._resolved is not None and self._resolved[0][0] != due[0] and self.device.type == "cuda":
                 torch.cuda.empty_cache()  # buffers of another footprint have other sizes
-            self._resolved = due, self.pictures.resolve(footprint=due[0], sh_degree=due[1])
+            self._resolved = due, self.pictures.resolve(self.options.order, footprint=due[0], sh_degree=due[1])
             self._cameras = {}
         return self._resolved[1]
 

@@ -14,8 +14,10 @@ import torch
 
 from .. import io
 from ..cameras.rotations import rotation_matrices
-from ..footprints import footprint_variants
+from ..footprints import footprint_variants, resolve_footprint
 from ..gaussians import Gaussians
+from ..render.effects import Effects
+from ..render.order import CENTER, can_be_in
 from ..render.rasterizer import GaussianRasterizer
 
 MOVING_SECONDS = 0.06
@@ -58,8 +60,10 @@ def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
 
 
 @torch.no_grad()
-def render_frame(scene: Gaussians, view: io.View, footprint: str, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Renders a view on the device of the scene.
+def render_frame(
+    scene: Gaussians, view: io.View, footprint: str, background=(0.0, 0.0, 0.0), order: str = CENTER
+) -> np.ndarray:
+    """Renders a view on the device of the scene, in an `Effects.order` if the footprint can have it.
 
     Returns:
         (H, W, 3) uint8: the rasterizer's picture, clamped to [0, 1] and rounded to 8 bits.
@@ -67,7 +71,8 @@ def render_frame(scene: Gaussians, view: io.View, footprint: str, background=(0.
     Raises:
         ValueError: As `resolve_footprint` and `GaussianRasterizer`.
     """
-    settings = view.settings(1.0, background, scene.sh_degree, footprint, device=scene.means.device)
+    effects = Effects(order=order if can_be_in(resolve_footprint(footprint), order) else CENTER)
+    settings = view.settings(1.0, background, scene.sh_degree, footprint, device=scene.means.device, effects=effects)
     color, *_ = GaussianRasterizer(settings)(means2D=None, **scene.arguments())
     return color.clamp(0, 1).mul(255).round().to("cpu", torch.uint8).permute(1, 2, 0).contiguous().numpy()
 

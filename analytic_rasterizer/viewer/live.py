@@ -19,6 +19,7 @@ from .. import io
 from ..cameras.up import mean_up
 from ..footprints import Footprint, get_default_footprint, resolve_footprint
 from ..gaussians import Gaussians
+from ..render.order import CENTER, check_order
 from .frames import (
     LIVE_FOOTPRINTS,
     SMALLEST_MOVING_SCALE,
@@ -96,6 +97,7 @@ class LiveViewer:
         background=(0.0, 0.0, 0.0),
         name: str = "scene",
         interval: float = 1.0,
+        order: str = CENTER,
     ):
         """Starts the server.
 
@@ -106,14 +108,17 @@ class LiveViewer:
             background: (r, g, b) in [0, 1].
             name: What the page calls the scene.
             interval: Seconds between two copies of the scene, at least; not negative.
+            order: An `Effects.order`, for the footprints that can have it.
 
         Raises:
             ImportError: viser is missing; names the extra that installs it.
-            ValueError: A port that cannot be used, or a bad footprint, background or interval.
+            ValueError: A port that cannot be used, or a bad footprint, background, interval or order.
             RuntimeError: A version of viser that cannot be given an access check.
         """
         chosen = get_default_footprint() if footprint is None else resolve_footprint(str(footprint))
         self.footprint = next((c for c in LIVE_FOOTPRINTS if resolve_footprint(c) == chosen), str(chosen))
+        check_order(order)
+        self.order = order
         self.background = tuple(float(channel) for channel in background)
         if len(self.background) != 3 or not all(0 <= channel <= 1 for channel in self.background):
             raise ValueError(f"background must be three numbers from 0 to 1, got {background}")
@@ -367,7 +372,7 @@ class LiveViewer:
         scaled = view.scaled(scale)
         background = [channel / 255 for channel in client.background.value]
         snapshot.wait()
-        frame = render_frame(snapshot.scene, scaled, client.footprint.value, background)
+        frame = render_frame(snapshot.scene, scaled, client.footprint.value, background, self.order)
         seconds = time.monotonic() - start
         with self._changed:
             if client.handle.client_id not in self._clients:

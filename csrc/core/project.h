@@ -65,6 +65,7 @@ template <typename T> struct ProjectedGaussian {
   Cov2d<T> cov;
   T opacity;  ///< with the amplitude of a camera's blur
   T depth;
+  Vec2<T> slope = {T(0), T(0)};  ///< of RayDepth (core/order.h), if the order is along rays
 };
 
 /// False if the matrix is no covariance, or derived numbers would overflow a float.

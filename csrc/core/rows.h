@@ -87,6 +87,7 @@ AR_HD void write_row(const RowOutputs<T>& to, int64_t row, int64_t gaussian, con
   } else {
     to.radii[row] = radius;
   }
+  if (to.slopes) to.slopes[row] = p.slope;
   if (to.gaussian_ids) to.gaussian_ids[row] = int32_t(gaussian);
   if (to.camera_ids) to.camera_ids[row] = to.camera;
 }

@@ -242,7 +242,8 @@ template <typename T> struct RowOutputs : ProjectedRows<T> {
   int32_t* gaussian_ids = nullptr;            ///< [rows]
   int32_t* camera_ids = nullptr;              ///< [rows]
   int32_t camera = 0;
-  RowPlaces places;  ///< without `ends` a table: a Gaussian without a row has zeros, and det -1
+  RowPlaces places;           ///< without `ends` a table: a Gaussian without a row has zeros, and det -1
+  Vec2<T>* slopes = nullptr;  ///< [rows] of RayDepth (core/order.h)
 };
 
 /// Sent to other ranks.

@@ -1,7 +1,7 @@
 // The backward pass of the CPU, stage by stage in the order of Backend (torch/backend.h), called as forward.cpp is, and
 // the loops that each stage runs:
 //
-//   blend_vjp      gradients of images to a row for each pair                 blend_vjp.h
+//   blend_vjp      gradients of images to a row for each pair                 blend_vjp.h, blend_rays_vjp.h
 //   sum_channels   rows of pairs to gradients of channels                     sum_channels.h
 //   project_vjp    rows of pairs, or gradients of public rows, to gradients   project.h, rows.h
 //                  of Gaussians and cameras
@@ -11,7 +11,8 @@
 namespace ar::cpu {
 
 template <typename T> void blend_vjp(int footprint, const BlendVjpParams<T>& p) {
-  stages_of<T>(footprint).blend_vjp(p);
+  const Stages<T>& stages = stages_of<T>(footprint);
+  p.order.window ? stages.blend_rays_vjp(p) : stages.blend_vjp(p);
 }
 template <typename T> void sum_channels(const SumChannelsParams<T>& p) { stages_of<T>().sum_channels(p); }
 

@@ -21,6 +21,38 @@ template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance
   return open;
 }
 
+/// Sums over samples to images. `colors`: as blend_tile() leaves them. Transmittances may be negative.
+template <int kSamples, typename T>
+void store_pixels(const cpu::BlendParams<T>& p, const TileView& view, T (&transmittance)[kSamples][kTilePixels],
+                  const int32_t (&last)[kSamples][kTilePixels], T* colors) {
+  using V = typename LanesOf<T>::Type;
+  constexpr int kCount = LanesOf<T>::kCount;
+  const int channels = p.channels.count;
+  const int64_t size = int64_t(p.grid.width) * p.grid.height;
+  alignas(64) T through[kTilePixels] = {};  // Mean transmittance.
+  for (int s = 0; s < kSamples; ++s) {
+    for (int i = 0; i < kTilePixels; ++i) {
+      transmittance[s][i] = std::abs(transmittance[s][i]);
+      through[i] += transmittance[s][i] / T(kSamples);
+    }
+    if (p.transmittance) store_tile<T>(view, p.grid, transmittance[s], p.transmittance + s * size);
+    if (p.last) store_tile<T>(view, p.grid, last[s], p.last + s * size);
+  }
+  alignas(64) T plane[kTilePixels];
+  for (int channel = 0; channel < channels; ++channel) {
+    const V samples(T{kSamples}), background(p.background[channel]);
+    for (int i = 0; i < kTilePixels; i += kCount) {
+      const V sum = load(channels_at(colors, i, channels) + channel * kCount, V());
+      store(plane + i, sum / samples + load(through + i, V()) * background);
+    }
+    store_tile<T>(view, p.grid, plane, p.image.plane(channel, size));
+  }
+  if (p.alpha) {
+    for (int i = 0; i < kTilePixels; ++i) through[i] = T(1) - through[i];
+    store_tile<T>(view, p.grid, through, p.alpha);
+  }
+}
+
 /// `colors`: scratch.
 template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* colors) {
   using V = typename LanesOf<T>::Type;
@@ -107,29 +139,7 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
       });
     }
   }
-  const int64_t size = int64_t(p.grid.width) * p.grid.height;
-  alignas(64) T through[kTilePixels] = {};  // Mean transmittance.
-  for (int s = 0; s < kSamples; ++s) {
-    for (int i = 0; i < kTilePixels; ++i) {
-      transmittance[s][i] = std::abs(transmittance[s][i]);
-      through[i] += transmittance[s][i] / T(kSamples);
-    }
-    if (p.transmittance) store_tile<T>(view, p.grid, transmittance[s], p.transmittance + s * size);
-    if (p.last) store_tile<T>(view, p.grid, last[s], p.last + s * size);
-  }
-  alignas(64) T plane[kTilePixels];
-  for (int channel = 0; channel < channels; ++channel) {
-    const V samples(T{kSamples}), background(p.background[channel]);
-    for (int i = 0; i < kTilePixels; i += kCount) {
-      const V sum = load(channels_at(colors, i, channels) + channel * kCount, V());
-      store(plane + i, sum / samples + load(through + i, V()) * background);
-    }
-    store_tile<T>(view, p.grid, plane, p.image.plane(channel, size));
-  }
-  if (p.alpha) {
-    for (int i = 0; i < kTilePixels; ++i) through[i] = T(1) - through[i];
-    store_tile<T>(view, p.grid, through, p.alpha);
-  }
+  store_pixels<kSamples>(p, view, transmittance, last, colors);
 }
 
 template <class P, typename T> void blend(const cpu::BlendParams<T>& p) {

@@ -23,6 +23,27 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
+/// Of all channels: what blend_sample_vjp calls `behind`, after the last splat.
+template <typename T>
+void load_background(const cpu::BlendVjpParams<T>& p, const TileView& view, T samples, const T* gradient, T* behind) {
+  constexpr int kCount = LanesOf<T>::kCount;
+  using V = typename LanesOf<T>::Type;
+  const int channels = p.channels.count;
+  for (int i = 0; i < kTilePixels; i += kCount) {
+    V sum = V(T(0));
+    for (int c = 0; c < channels; ++c) {
+      const V g = load(gradient + i * channels + c * kCount, V());
+      sum = sum + g * V(p.background[c]);
+    }
+    store(behind + i, sum);
+  }
+  if (!p.dL_dalpha) return;
+  // Alpha is a channel of black splats on a background of -1.
+  alignas(64) T dL_dalpha[kTilePixels] = {};
+  load_tile<T>(view, p.grid, p.dL_dalpha, dL_dalpha);
+  for (int i = 0; i < kTilePixels; ++i) behind[i] -= dL_dalpha[i] / samples;
+}
+
 /// Channels after the third change no bit if their gradient is zero.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
@@ -60,22 +81,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   LastPairs<T> pack_last = {};
   int32_t tile_last = 0;
   load_gradient(p, view, with_shape ? 0 : p.first, loaded, T(kSamples), gradient);
-  if (with_shape) {
-    for (int i = 0; i < kTilePixels; i += kCount) {
-      V sum = V(T(0));
-      for (int c = 0; c < loaded; ++c) {
-        const V g = load(channels_at(gradient, i, loaded) + c * kCount, V());
-        sum = sum + g * V(p.background[c]);
-      }
-      store(behind_all + i, sum);
-    }
-    if (p.dL_dalpha) {
-      // Alpha is a channel of black splats on a background of -1.
-      alignas(64) T dL_dalpha[kTilePixels] = {};
-      load_tile<T>(view, p.grid, p.dL_dalpha, dL_dalpha);
-      for (int i = 0; i < kTilePixels; ++i) behind_all[i] -= dL_dalpha[i] / T(kSamples);
-    }
-  }
+  if (with_shape) load_background(p, view, T(kSamples), gradient, behind_all);
   for (int s = 0; s < kSamples; ++s) {
     std::fill_n(transmittance[s], kTilePixels, T(1));
     load_tile<T>(view, p.grid, p.transmittance + s * size, transmittance[s]);

@@ -3,7 +3,7 @@
 //
 //   project   Gaussians to splats, or to public rows             project.h, rows.h
 //   bin       splats to the list of each tile, sorted by depth   bin.h, sort.cpp
-//   blend     lists to images                                    blend.h
+//   blend     lists to images                                    blend.h, blend_rays.h
 //   inspect   lists to statistics of pixels and Gaussians        inspect.h
 //
 // The loops are compiled for several instruction sets. stages_of() is the table of the one that instruction_sets.cpp
@@ -38,7 +38,10 @@ template <typename T> void scatter_pairs(BinParams<T>& p) { stages_of<T>().scatt
 
 // blend
 
-template <typename T> void blend(int footprint, const BlendParams<T>& p) { stages_of<T>(footprint).blend(p); }
+template <typename T> void blend(int footprint, const BlendParams<T>& p) {
+  const Stages<T>& stages = stages_of<T>(footprint);
+  p.order.window ? stages.blend_rays(p) : stages.blend(p);
+}
 
 // inspect
 

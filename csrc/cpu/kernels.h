@@ -4,8 +4,7 @@
 
 #include "core/footprint/registry.h"
 #include "cpu/bin.h"
-#include "cpu/blend.h"
-#include "cpu/blend_vjp.h"
+#include "cpu/blend_rays_vjp.h"
 #include "cpu/project.h"
 
 namespace ar::AR_ISA {
@@ -17,6 +16,10 @@ template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu
     if constexpr (kReferences || !F::kReference) {
       stages.blend = blend<PixelsOf<F>, T>;
       stages.blend_vjp = blend_vjp<PixelsOf<F>, T>;
+      if constexpr (F::kAlongRays) {
+        stages.blend_rays = blend_rays<PixelsOf<F>, T>;
+        stages.blend_rays_vjp = blend_rays_vjp<PixelsOf<F>, T>;
+      }
     }
   });
 }

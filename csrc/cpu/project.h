@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "core/order.h"
 #include "core/rows.h"
 #include "cpu/chunks.h"
 #include "cpu/prefetch.h"
@@ -34,6 +35,13 @@ template <template <typename> class Cam, typename T> void count_candidates(const
   });
 }
 
+/// Of RayDepth. One copy, because few calls want it.
+template <class Cam, typename T>
+AR_ONE_COPY Vec2<T> slope_of(const Cam& camera, const Gaussians<T>& g, int64_t i, DepthKind order) {
+  const Vec3<T> view = project_mean(camera, g.means[i]).view;
+  return ray_slope(camera, g, i, view, depth_by_vjp(order, camera, view, T(1)));
+}
+
 template <template <typename> class Cam, typename T> void project(const cpu::ProjectParams<T>& p) {
   auto* splats = reinterpret_cast<SplatRow<T>*>(p.splats);
   for_each_chunk(p.gaussians.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
@@ -55,6 +63,7 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
       }
       splats[j] = splat;
       p.depths[j] = depth;
+      if (p.slopes && splat.level > T(0)) p.slopes[j] = slope_of(camera, p.gaussians, i, DepthKind::kOfModel);
       p.ids[j] = int32_t(i);
       ++j;
     }
@@ -84,6 +93,7 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
         if (projects) write_packed(p.packed, i, projected, splat.color, radius);
         continue;
       }
+      if (p.rows.slopes && radius > 0) projected.slope = slope_of(camera, g, i, p.rules.order);
       write_row_or_flag(camera, p.rules, p.rows, p.flags, i, mean.view, projected, splat.color, radius);
     }
   });

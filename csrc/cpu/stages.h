@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "core/bin.h"
+#include "core/order.h"
 #include "core/rows.h"
 #include "core/weight.h"
 
@@ -34,6 +35,7 @@ template <typename T> struct ProjectParams : ar::ProjectParams<T> {
   int64_t* chunk_offsets;  ///< [chunks + 1] counts, then prefix sums. The last is zero at first.
   int32_t* ids;            ///< [candidates] ascending.
   T* depths;               ///< [candidates].
+  Vec2<T>* slopes;         ///< [candidates] of RayDepth, or null.
 };
 
 template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
@@ -78,10 +80,17 @@ struct TileLists {
   const int64_t* tile_offsets;
 };
 
+/// For blend_rays and blend_rays_vjp.
+template <typename T> struct RayOrder {
+  const RayDepth<T>* depths;  ///< [splats].
+  int window;                 ///< Slots.
+};
+
 template <typename T> struct BlendParams : ar::BlendParams<T> {
   TileLists lists;
   int threads;
   T* scratch;  ///< [threads, channels.count, kTile * kTile].
+  RayOrder<T> order;
 };
 
 /// A call per window of channels.
@@ -96,7 +105,8 @@ template <typename T> struct BlendVjpParams : ar::BlendVjpParams<T> {
   T* channel_sums;      ///< [pairs, channel_stride].
   int64_t channel_stride;
   T* scratch;  ///< [threads, channels.count, kTile * kTile].
-  T* replay;   ///< [threads, kReplayNumbers] if Stages::moves.
+  T* replay;   ///< [threads, kReplayNumbers] if Stages::moves and the order is that of centres.
+  RayOrder<T> order;
 };
 
 struct SplatPairs {
@@ -160,7 +170,7 @@ template <typename T> struct CameraStages {
   void (*project_rows_vjp)(const ProjectRowsVjpParams<T>&);
 };
 
-/// The last five depend on the footprint.
+/// The last seven depend on the footprint.
 template <typename T> struct Stages {
   int samples;
   bool moves;
@@ -172,6 +182,9 @@ template <typename T> struct Stages {
   void (*sum_channels)(const SumChannelsParams<T>&);
   void (*blend)(const BlendParams<T>&);
   void (*blend_vjp)(const BlendVjpParams<T>&);
+  /// In the order along rays; null if the footprint has none.
+  void (*blend_rays)(const BlendParams<T>&);
+  void (*blend_rays_vjp)(const BlendVjpParams<T>&);
   void (*inspect)(const InspectParams<T>&);
   void (*weight)(const WeightParams<T>&);
   void (*weight_vjp)(const WeightParams<T>&);

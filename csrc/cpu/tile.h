@@ -52,6 +52,7 @@ template <typename T> struct PackSet {
 
   /// Bit i: pack first + i.
   AR_HD void add(int first, uint64_t bits) { words[first / kBits] |= bits << first % kBits; }
+  AR_HD bool has(int pack) const { return words[pack / kBits] >> pack % kBits & 1; }
   AR_HD bool is_empty() const {
     uint64_t any = 0;
     for (const uint64_t word : words) any |= word;

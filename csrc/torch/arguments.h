@@ -217,6 +217,7 @@ struct BinArguments : ImageArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
   Tensor row_splits;  ///< (C + 1,) int64 on the CPU: first row of each camera.
   bool keep = true;
+  OptionalTensor slopes;  ///< (N, 2) of `project`, in the order along rays.
 
   template <class Visit> void each(Visit&& visit) {
     visit("means2d", means2d);
@@ -227,6 +228,7 @@ struct BinArguments : ImageArguments {
     visit("row_splits", row_splits);
     ImageArguments::each(visit);
     visit("keep=True", keep);
+    visit("slopes=None", slopes);
   }
 };
 
@@ -261,6 +263,7 @@ struct CompositeArguments : ImageArguments {
   double center = 0;      ///< Of pixels, in means2d.
   bool expected = false;  ///< The last channel is divided by alpha.
   bool keep = false;
+  OptionalTensor slopes;            ///< As in BinArguments.
   int64_t background_channels = 0;  ///< Of `background` as given; check() fills it up.
 
   template <class Visit> void each(Visit&& visit) {
@@ -277,6 +280,7 @@ struct CompositeArguments : ImageArguments {
     visit("center=0.0", center);
     visit("expected=False", expected);
     visit("keep=False", keep);
+    visit("slopes=None", slopes);
   }
 };
 

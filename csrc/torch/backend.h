@@ -22,6 +22,7 @@ namespace ar::ops {
 struct SplatTensors {
   Tensor splats;       ///< (n, kSplatWidth).
   Tensor ids, depths;  ///< CPU: (n,), ids ascending.
+  Tensor slopes;       ///< CPU: (n, 2) of RayDepth, in the order along rays.
   // CUDA:
   Tensor counts;  ///< Counts, zero.
   Tensor ranges;  ///< (n, kRangeWidth) PairRange.
@@ -37,9 +38,10 @@ struct ListTensors {
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions. CUDA: (n, kRangeWidth) int32 PairRange.
   Tensor positions;      ///< CPU: (N,) int64 indices of pairs, by splat.
   Tensor counts;         ///< CUDA: (kCountsWidth,) int64 Counts.
+  Tensor rays;           ///< (n, kRayWidth) RayDepth, in the order along rays.
 
-  static constexpr size_t kMembers = 7;
-  static constexpr int64_t kPairWidth = 2, kRangeWidth = 2, kCountsWidth = 4;
+  static constexpr size_t kMembers = 8;
+  static constexpr int64_t kPairWidth = 2, kRangeWidth = 2, kCountsWidth = 4, kRayWidth = 3;
   template <class Visit> void each(Visit&& visit) {
     visit("splats", splats);
     visit("ids", ids);
@@ -48,6 +50,7 @@ struct ListTensors {
     visit("splat_offsets", splat_offsets);
     visit("positions", positions);
     visit("counts", counts);
+    visit("rays", rays);
   }
 };
 
@@ -117,6 +120,7 @@ struct PairSums {
 /// ProjectedRows of core/stages.h, or their gradient.
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
+  Tensor slopes;    ///< (n, 2) of RayDepth, in the order along rays.
   Tensor absolute;  ///< Of a gradient: (n, 2) sums of |dL/dmeans2d|.
   Tensor packed;    ///< PackedRow or its gradient, instead of all others.
   KeptRows kept;
@@ -132,6 +136,7 @@ struct ProjectedTensors {
   Tensor features;                  ///< (n, K), three colours first if `colored`, a depth last if `shows_depth`.
   Tensor radii;                     ///< (n,), or (n, 2) of a RowMeasure, which has conics too.
   Tensor conics, shown_opacities;   ///< Or undefined.
+  Tensor slopes;                    ///< (n, 2) of RayDepth; undefined: not in the order along rays.
   Tensor gaussian_ids, camera_ids;  ///< Or undefined.
   Tensor ends;                      ///< (P,) int32 of this camera; undefined: a table.
   Tensor flags;                     ///< (P,) int32, instead of all others.
@@ -170,7 +175,12 @@ struct FootprintSpec {
   int samples;  ///< Per pixel.
   bool moves;   ///< Samples have a position as state.
   int lanes;    ///< Of CUDA, for a pixel's samples.
+  int window;   ///< Slots, in the order along rays (core/order.h); 0: in the order of centres.
+
+  bool along_rays() const { return window > 0; }
 };
+/// In keys of the order along rays, between a key of the registry and the size of the window: "moment4:ray24".
+inline constexpr std::string_view kRayMark = ":ray";
 FootprintSpec find_footprint(const std::string& key, double option);
 
 /// On CUDA some have small tiles (cuda/dispatch.h).
@@ -187,7 +197,10 @@ struct Pass {
   Pass(const Arguments& a, const Tensor& like)
       : footprint(find_footprint(a.footprint, a.option)),
         grid(grid_of(footprint, a.image_width, a.image_height, like.is_cuda())),
-        exact(at::globalContext().deterministicAlgorithms()) {}
+        exact(at::globalContext().deterministicAlgorithms()) {
+    TORCH_CHECK_NOT_IMPLEMENTED(!footprint.along_rays() || !like.is_cuda(),
+                                "order 'ray' cannot be rendered on CUDA yet: render on the CPU, or in order 'center'");
+  }
 };
 
 /// Memory for what all devices have.

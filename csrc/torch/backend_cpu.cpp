@@ -1,6 +1,7 @@
 // Backend for CPU tensors of float32 or float64: allocates, and calls the stages of csrc/cpu. Tensors are checked; the
 // contents of lists are trusted.
 #include <ATen/ops/arange.h>
+#include <ATen/ops/cat.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/Parallel.h>
@@ -93,9 +94,11 @@ template <typename T> class CpuBackend final : public Backend {
     out.splats = make_buffer({count, kSplatWidth}, floats_);
     out.ids = at::empty({count}, ints_);
     out.depths = at::empty({count}, floats_);
+    if (pass.footprint.along_rays()) out.slopes = at::zeros({count, 2}, floats_);
     p.splats = pointer<T>(out.splats);
     p.ids = pointer<int32_t>(out.ids);
     p.depths = pointer<T>(out.depths);
+    p.slopes = pointer<Vec2<T>>(out.slopes);
     cpu::project(p);
     return out;
   }
@@ -125,6 +128,7 @@ template <typename T> class CpuBackend final : public Backend {
     out.splats = at::empty({n, kSplatWidth}, floats_);
     out.ids = at::arange(n, ints_);
     out.depths = rows.packed.defined() ? rows.packed.select(1, kPackedDepth).contiguous() : rows.depths;
+    out.slopes = rows.slopes;
     cpu::ShapeRowsParams<T> p = {};
     set_shape_rows<T>(p, rows, pass, out.splats);
     p.threads = thread_count();
@@ -158,6 +162,8 @@ template <typename T> class CpuBackend final : public Backend {
     p.positions = pointer<int64_t>(out.positions);
     cpu::scatter_pairs(p);
     out.counts = at::empty({0}, longs_);
+    const bool along_rays = pass.footprint.along_rays();
+    out.rays = along_rays ? at::cat({splats.depths.unsqueeze(1), splats.slopes}, 1) : at::empty({0}, floats_);
     return out;
   }
 
@@ -172,6 +178,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.threads = thread_count();
     const Tensor scratch = make_scratch(p.threads, channels.count);
     p.scratch = pointer<T>(scratch);
+    p.order = ray_order_of(lists, pass, channels);
     cpu::blend(pass.footprint.choice.index, p);
   }
 
@@ -204,7 +211,9 @@ template <typename T> class CpuBackend final : public Backend {
     p.mean_sums = mean_sums;
     p.pair_means = pointer<Vec2<T>>(out.means);
     const int footprint = pass.footprint.choice.index;
-    const Tensor replay = at::empty({pass.footprint.moves ? p.threads : 0, cpu::kReplayNumbers}, floats_);
+    p.order = ray_order_of(lists, pass, channels);
+    const bool replays = pass.footprint.moves && !pass.footprint.along_rays();
+    const Tensor replay = at::empty({replays ? p.threads : 0, cpu::kReplayNumbers}, floats_);
     p.replay = pointer<T>(replay);
     if (own) {
       p.count = 3;
@@ -286,6 +295,12 @@ template <typename T> class CpuBackend final : public Backend {
 
  private:
   using Clock = std::chrono::steady_clock;
+
+  static cpu::RayOrder<T> ray_order_of(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels) {
+    TORCH_CHECK_VALUE(!pass.footprint.along_rays() || channels.count <= kMaxRayChannels,
+                      "order 'ray' can blend at most ", kMaxRayChannels, " channels, got ", channels.count);
+    return {const_pointer<RayDepth<T>>(lists.rays), pass.footprint.window};
+  }
 
   /// For project_vjp and row_grads.
   template <class Params> static void set_pair_sums(Params& p, const ListTensors& lists, const PairSums& sums) {

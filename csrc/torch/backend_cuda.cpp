@@ -106,6 +106,7 @@ class CudaBackend final : public Backend {
     out.ids = at::empty({n}, ints_);
     out.positions = at::empty({0}, longs_);
     out.counts = splats.counts;
+    out.rays = at::empty({0}, floats_);
     auto* counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
     cuda::DepthSort by_depth = {};
     by_depth.n = n;

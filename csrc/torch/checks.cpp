@@ -8,10 +8,12 @@
 #include <ATen/ops/zeros.h>
 
 #include <algorithm>
+#include <charconv>
 #include <cmath>
 
 #include "core/camera.h"
 #include "core/footprint/registry.h"
+#include "core/order.h"
 #include "core/sh.h"
 #include "torch/check_tensors.h"
 
@@ -74,6 +76,13 @@ void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& 
   TORCH_CHECK_VALUE(rises_to(row_splits, n), "row_splits must rise from 0 to the number of rows, ", n);
 }
 
+void check_slopes(OptionalTensor& slopes, const Like& like, const Pass& pass) {
+  TORCH_CHECK_VALUE(slopes || !pass.footprint.along_rays(),
+                    "slopes must have shape (N, 2) in order 'ray', got none: `project` returns them for settings with "
+                    "this order");
+  like.check_rows_of(slopes, "slopes", {2}, "(N, 2)");
+}
+
 /// Pixels of a Gaussian are counted in int32.
 void check_countable(const SummarySwitches& wanted, int64_t height, int64_t width) {
   constexpr int64_t kMostPixels = int64_t(1) << 31;
@@ -102,17 +111,31 @@ void check_gaussians(Inputs in) {
 }  // namespace
 
 FootprintSpec find_footprint(const std::string& key, double option) {
-  const int index = ar::find_footprint(key);
+  const size_t end = std::min(key.find(kRayMark), key.size());
+  const int index = ar::find_footprint(std::string_view(key).substr(0, end));
   TORCH_CHECK_VALUE(index >= 0, "footprint must be one of those in csrc/core/footprint/registry.h, got '", key, "'");
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
   FootprintSpec spec = {};
+  bool along_rays = false;
   spec.choice = {index, {option}};
   visit_footprint(index, Footprints{}, [&](auto f) {
     spec.samples = decltype(f)::kSamples;
     spec.moves = decltype(f)::kMoves;
     spec.lanes = spread_lanes<decltype(f)>();
+    along_rays = decltype(f)::kAlongRays;
   });
+  if (end == key.size()) return spec;
+  TORCH_CHECK_VALUE(along_rays, "order 'ray' cannot be combined with footprint ", key.substr(0, end));
+  const char* const digits = key.data() + end + kRayMark.size();
+  const auto [stop, error] = std::from_chars(digits, key.data() + key.size(), spec.window);
+  TORCH_CHECK_VALUE(
+      error == std::errc() && stop == key.data() + key.size() && spec.window >= 1 && spec.window <= kMaxRayWindow,
+      "the window of order 'ray' must be 1 to ", kMaxRayWindow, ", got '", digits, "'");
   return spec;
+}
+
+void refuse_rays(const Pass& pass, const char* what) {
+  TORCH_CHECK_VALUE(!pass.footprint.along_rays(), what, " cannot be combined with order 'ray'");
 }
 
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
@@ -224,10 +247,11 @@ void check_values(const RasterizeArguments& a) {
   if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
 }
 
-void check(BinArguments& a) {
+void check(BinArguments& a, const Pass& pass) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
   const Like like{a.means2d, "means2d"};
   like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  check_slopes(a.slopes, like, pass);
   check_image_size(a.image_height, a.image_width);
 }
 
@@ -255,7 +279,7 @@ void check(BlendArguments& a, const Pass& pass) {
   }
 }
 
-void check(CompositeArguments& a) {
+void check(CompositeArguments& a, const Pass& pass) {
   // Of a table, whose rows are those of a matrix.
   for (Tensor* t : {&a.means2d, &a.cov2d}) {
     if (t->dim() > 2) *t = t->reshape({-1, t->size(-1)});
@@ -264,10 +288,12 @@ void check(CompositeArguments& a) {
     if (t->dim() > 1) *t = t->reshape({-1});
   }
   if (a.means2d_abs && a.means2d_abs->dim() > 2) a.means2d_abs = a.means2d_abs->reshape({-1, 2});
+  if (a.slopes && a.slopes->dim() > 2) a.slopes = a.slopes->reshape({-1, 2});
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
   const Like like{a.means2d, "means2d"};
   const int64_t cameras = a.row_splits.size(0) - 1;
   like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  check_slopes(a.slopes, like, pass);
   like.check_channels(a.features, "features", 'N', 'K', kMaxChannels);
   like.check_rows_of(a.means2d_abs, "means2d_abs", {2}, "(N, 2)");
   check_image_size(a.image_height, a.image_width);
@@ -370,14 +396,16 @@ void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass)
          lists.tile_offsets.is_contiguous() && lists.tile_offsets.device().is_cpu() &&
          lists.tile_offsets.const_data_ptr<int64_t>()[grid.tiles()] == pairs.numel();
   }
+  const bool along_rays = pass.footprint.along_rays();
+  ok = ok && lists.rays.numel() == (along_rays ? n * ListTensors::kRayWidth : 0);
   const auto fits = [&](const Tensor& t, at::ScalarType dtype) {
     return t.is_contiguous() && t.device() == like.device() && (t.numel() == 0 || t.scalar_type() == dtype);
   };
-  ok = ok && fits(splats, like.scalar_type()) && fits(lists.ids, at::kInt) && fits(pairs, at::kInt) &&
-       fits(lists.tile_offsets, at::kLong) && fits(lists.positions, at::kLong) && fits(lists.counts, at::kLong) &&
-       fits(lists.splat_offsets, like.is_cuda() ? at::kInt : at::kLong);
+  ok = ok && fits(splats, like.scalar_type()) && fits(lists.rays, like.scalar_type()) && fits(lists.ids, at::kInt) &&
+       fits(pairs, at::kInt) && fits(lists.tile_offsets, at::kLong) && fits(lists.positions, at::kLong) &&
+       fits(lists.counts, at::kLong) && fits(lists.splat_offsets, like.is_cuda() ? at::kInt : at::kLong);
   TORCH_CHECK_VALUE(ok,
-                    "splats ... counts must be what the forward pass saved for the same arguments, got splats of "
+                    "splats ... rays must be what the forward pass saved for the same arguments, got splats of "
                     "shape ",
                     shape_of(splats), " and tile_offsets of shape ", shape_of(lists.tile_offsets));
 }

@@ -9,14 +9,16 @@ namespace ar::ops {
 
 /// Afterwards every tensor is contiguous, and matrices are 4x4.
 void check(Inputs& in);
+/// Raises in the order along rays, with which `what` cannot be combined.
+void refuse_rays(const Pass& pass, const char* what);
 void check(RasterizeArguments& a);
 /// The camera's numbers are finite. On CUDA, where the host waits, only with `debug`.
 void check_values(const Inputs& in, bool debug);
 /// And with debug those of the Gaussians are valid.
 void check_values(const RasterizeArguments& a);
-void check(BinArguments& a);
+void check(BinArguments& a, const Pass& pass);
 void check(BlendArguments& a, const Pass& pass);
-void check(CompositeArguments& a);
+void check(CompositeArguments& a, const Pass& pass);
 void check(SeamArguments& a);
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);

@@ -25,6 +25,7 @@ struct CameraRows {
       : rows(shapes_of(a, c)),
         channels(row_channels(rows_of(a.features, a.row_splits, c), a.background->select(0, c))) {
     rows.depths = rows_of(a.depths, a.row_splits, c);
+    if (a.slopes) rows.slopes = rows_of(*a.slopes, a.row_splits, c);
     rows.center = a.center;
     if (channels.count == 3) {  // In the splats themselves, where they take least time.
       std::swap(rows.colors, channels.rows);
@@ -41,7 +42,7 @@ Tensor seen_alpha(const Tensor& alpha) { return alpha.clamp_min(kSmallestAlpha);
 Results composite(CompositeArguments a) {
   Pass pass(a, a.means2d);
   pass.keep = a.keep;
-  check(a);
+  check(a, pass);
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   const int64_t cameras = a.row_splits.numel() - 1, channels = a.features.size(1);
   const int64_t height = a.image_height, width = a.image_width;
@@ -73,9 +74,9 @@ Results composite(CompositeArguments a) {
 Results composite_vjp(VjpArguments<CompositeArguments> arguments) {
   CompositeArguments& a = arguments.of_op;
   const Pass pass(a, a.means2d);
-  check(a);
+  check(a, pass);
   const std::vector<bool>& needs = arguments.needs;
-  check_needs(needs, 9);
+  check_needs(needs, 10);
   const int64_t cameras = a.row_splits.numel() - 1, channels = a.features.size(1), n = a.means2d.size(0);
   const int64_t height = a.image_height, width = a.image_width;
   const size_t members = size_t(cameras) * kOfCamera + (a.expected ? 2 : 0);
@@ -133,7 +134,8 @@ Results composite_vjp(VjpArguments<CompositeArguments> arguments) {
                              wanted(3, dL_dfeatures), wanted(4, dL_dbackground), or_empty(all.absolute, a.means2d)};
   out.push_back(needs[6] ? at::zeros_like(a.dets) : at::empty({0}, options));
   out.push_back(needs[7] ? at::zeros_like(a.depths) : at::empty({0}, options));
-  out.push_back(at::empty({0}, options));  // row_splits
+  out.push_back(at::empty({0}, options));                                         // row_splits
+  out.push_back(needs[9] ? at::zeros_like(*a.slopes) : at::empty({0}, options));  // Which order rows, too.
   return {out};
 }
 

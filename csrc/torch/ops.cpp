@@ -55,7 +55,7 @@ template <class Visit> void each_op(const Visit& visit) {
              *projected =
                  "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor features, Tensor radii, "
                  "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor dets, Tensor conics, "
-                 "Tensor shown_opacities, Tensor[] saved",
+                 "Tensor shown_opacities, Tensor slopes, Tensor[] saved",
              *blended = "Tensor image, Tensor alpha, Tensor[] saved", *gradients = "Tensor[] gradients";
   visit(Op<RasterizeArguments, rasterize>{}, "rasterize", rasterized);
   visit(Op<RasterizeArguments, rasterize_timed>{}, "rasterize_timed", timed);
@@ -135,6 +135,7 @@ template <class F> pybind11::dict describe() {
   d["is_default"] = option.is_default;
   d["samples"] = F::kSamples;
   d["reference"] = F::kReference;
+  d["along_rays"] = F::kAlongRays;
   d["page"] = or_none(F::kPage);
   d["variance"] = F::support_variance({option.number});
   return d;
@@ -189,6 +190,7 @@ pybind11::dict saved_widths() {
   widths["pairs"] = ListTensors::kPairWidth;
   widths["splat_offsets"] = ListTensors::kRangeWidth;
   widths["counts"] = ListTensors::kCountsWidth;
+  widths["rays"] = ListTensors::kRayWidth;
   widths["chunks"] = BlendState::kChunkWidth;
   widths["covs"] = KeptRows::kCovWidth;
   widths["partials"] = kSsimPartials;
@@ -271,6 +273,7 @@ PYBIND11_MODULE(_C, m) {
       "withhold_output", [](const std::string& name) { ar::ops::withheld_output() = name; },
       "For tests: ops refuse this output as if no device made it; an empty name refuses none.");
   m.attr("TILE") = ar::kTile;
+  m.attr("RAY_MARK") = std::string(ar::ops::kRayMark);
   m.def(
       "tile_size",
       [](const std::string& footprint, double option, int64_t width, int64_t height, bool cuda) {

@@ -14,6 +14,8 @@
 namespace ar::ops {
 namespace {
 
+constexpr const char* kRanks = "rendering over several ranks";  // Whose rows have no slopes.
+
 void check_matrix_of(const Tensor& t, const char* name, const Tensor& like, int64_t width) {
   TORCH_CHECK_VALUE(t.dim() == 2 && t.size(1) == width && t.is_contiguous() && t.device() == like.device() &&
                         t.scalar_type() == like.scalar_type(),
@@ -84,6 +86,7 @@ struct SavedRows {
 Results count_rows(BatchArguments arguments) {
   ProjectArguments a = batch_of(arguments);
   const Pass pass(a, a.means3D);
+  refuse_rays(pass, kRanks);
   const int64_t cameras = check_cameras(a);
   const at::TensorOptions ints = a.means3D.options().dtype(at::kInt);
   Tensor ends;
@@ -102,6 +105,7 @@ Results count_rows(BatchArguments arguments) {
 
 Results pack_rows(PackArguments a) {
   const Pass pass(a, a.means3D);
+  refuse_rays(pass, kRanks);
   ProjectArguments batch = batch_of(a);
   const int64_t cameras = check_cameras(batch);
   TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
@@ -141,6 +145,7 @@ Results pack_rows_vjp(PackVjpArguments a) {
 
 Results blend_rows(BlendRowsArguments a) {
   Pass pass(a, a.rows);
+  refuse_rays(pass, kRanks);
   pass.keep = a.keep;
   check_floating(a.rows, "rows");
   check_packed_rows(a.rows, a.background);

@@ -58,7 +58,7 @@ struct Columns {
   int64_t count() const { return colors + values + depth; }
 };
 
-ProjectedTensors make_rows(int64_t n, const Columns& columns, const ProjectArguments& a) {
+ProjectedTensors make_rows(int64_t n, const Columns& columns, const ProjectArguments& a, bool along_rays) {
   const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
   ProjectedTensors rows;
   rows.means2d = at::empty(sizes_of(a, n, {2}), options);
@@ -66,6 +66,7 @@ ProjectedTensors make_rows(int64_t n, const Columns& columns, const ProjectArgum
   rows.dets = at::empty({n}, options);
   rows.opacities = at::empty(sizes_of(a, n, {}), options);
   rows.depths = at::empty(sizes_of(a, n, {}), options);
+  if (along_rays) rows.slopes = at::empty(sizes_of(a, n, {2}), options);
   rows.features = at::empty({n, columns.count()}, options);
   rows.radii = a.measured ? at::empty(sizes_of(a, n, {2}), ints) : at::empty({n}, ints);
   if (a.measured) rows.conics = at::empty(sizes_of(a, n, {3}), options);
@@ -114,7 +115,7 @@ Results project(ProjectArguments a) {
   }
   const int64_t n = splits[cameras];
   check_row_count(n, "means2d");
-  ProjectedTensors rows = make_rows(n, columns, a);
+  ProjectedTensors rows = make_rows(n, columns, a, pass.footprint.along_rays());
   for (int64_t c = 0; c < cameras && n > 0; ++c) {
     rows.camera = c;
     rows.first = splits[c];
@@ -144,6 +145,7 @@ Results project(ProjectArguments a) {
           rows.dets,
           or_none(rows.conics),
           or_none(rows.shown_opacities),
+          or_none(rows.slopes),
           saved};
 }
 

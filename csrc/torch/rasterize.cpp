@@ -16,6 +16,9 @@
 namespace ar::ops {
 namespace {
 
+/// They walk lists in the order of centres.
+constexpr const char* kSummaries = "median_depth, dominant_index and gaussian_stats";
+
 /// What is blended: colours, features, depth, inverse depth. Three colours alone lie in the splats, anything else in
 /// rows: `made` by the forward pass, or new ones.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
@@ -119,6 +122,7 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
     pass.exact |= exact;
     check(a);
     check_values(a);
+    if (any_of(a.summary)) refuse_rays(pass, kSummaries);
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);
     const auto lap = [&] {
       if (seconds) seconds->push_back(backend->lap());
@@ -217,6 +221,7 @@ Results inspect(InspectArguments a) {
                     "lists must be the output of list_tiles for one camera, got ", a.lists.size(), " tensors");
   const ListTensors lists = from_list<ListTensors>(a.lists, 0);
   const Pass pass(a, lists.splats);
+  refuse_rays(pass, kSummaries);
   check(a, lists, pass);
   const std::unique_ptr<Backend> backend = make_backend(lists.splats);
   const SummaryTensors summary = make_summary(*backend, a.summary, pass.grid, a.count(), lists.splats);

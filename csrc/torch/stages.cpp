@@ -37,12 +37,13 @@ struct CameraPart {
 Results bin(BinArguments a) {
   Pass pass(a, a.means2d);
   pass.keep = a.keep;
-  check(a);
+  check(a, pass);
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   std::vector<Tensor> out;
   for (int64_t c = 0; c + 1 < a.row_splits.size(0); ++c) {
     RowTensors rows = shapes_of(a, c);
     rows.depths = rows_of(a.depths, a.row_splits, c);
+    if (a.slopes) rows.slopes = rows_of(*a.slopes, a.row_splits, c);
     append_to(out, backend->bin(backend->shape_rows(rows, pass), pass));
   }
   return {out};

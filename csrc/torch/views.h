@@ -88,6 +88,7 @@ template <typename T> RowOutputs<T> row_outputs_of(const ProjectedTensors& rows)
   out.shown_opacities = pointer<T>(rows.shown_opacities);
   out.gaussian_ids = pointer<int32_t>(rows.gaussian_ids);
   out.camera_ids = pointer<int32_t>(rows.camera_ids);
+  out.slopes = pointer<Vec2<T>>(rows.slopes);
   out.camera = int32_t(rows.camera);
   out.places.ends = const_pointer<int32_t>(rows.ends);
   out.places.first = rows.first;

@@ -60,7 +60,7 @@ def test_names_are_those_of_both_versions():
     parameters = inspect.signature(rasterization).parameters
     positional = [name for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
     assert positional == SHARED + OF_1_5_3
-    assert set(parameters) == {*SHARED, *OF_1_6, "footprint"}
+    assert set(parameters) == {*SHARED, *OF_1_6, "footprint", "order"}
     defaults = {name: parameters[name].default for name in OF_1_6}
     assert defaults == {name: None for name in OF_1_6} | {"return_normals": False, "global_z_order": True}
     assert dialect.RENDER_MODES == MODES_OF_1_6

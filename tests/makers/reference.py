@@ -401,16 +401,12 @@ class Projection(NamedTuple):
     depths: torch.Tensor
 
 
-def project(settings, means, covariance):
-    """EWA projection of means (P, 3) and 3D covariances (P, 3, 3)."""
+def image_rows(settings, means):
+    """(P, 2, 3) of means (P, 3) in the world: the affine projection [EWA] from the world to px."""
     effects = effects_of(settings)
     size = means.new_tensor([settings.image_width, settings.image_height])
     viewmatrix, projmatrix = settings.viewmatrix.double(), settings.projmatrix.double()
-    homogeneous = torch.cat([means, torch.ones_like(means[:, :1])], -1)
-    view = homogeneous @ viewmatrix
-    clip = homogeneous @ projmatrix
-    means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
-
+    view = torch.cat([means, torch.ones_like(means[:, :1])], -1) @ viewmatrix
     tangent = torch.stack([torch.as_tensor(t, dtype=torch.float64) for t in (settings.tanfovx, settings.tanfovy)])
     focal = size / (2 * tangent)
     z = view[:, 2]
@@ -429,7 +425,18 @@ def project(settings, means, covariance):
         ],
         -2,
     )
-    to_image = jacobian @ viewmatrix[:3, :3].T
+    return jacobian @ viewmatrix[:3, :3].T
+
+
+def project(settings, means, covariance):
+    """EWA projection of means (P, 3) and 3D covariances (P, 3, 3)."""
+    size = means.new_tensor([settings.image_width, settings.image_height])
+    viewmatrix, projmatrix = settings.viewmatrix.double(), settings.projmatrix.double()
+    homogeneous = torch.cat([means, torch.ones_like(means[:, :1])], -1)
+    view = homogeneous @ viewmatrix
+    clip = homogeneous @ projmatrix
+    means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
+    to_image = image_rows(settings, means)
     full = to_image @ covariance @ to_image.transpose(-1, -2)
     cov2d = torch.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], -1)
     return Projection(means2d, cov2d, view[:, 2])
@@ -532,12 +539,14 @@ def render(
     *,
     footprint,
     keep_offsets=False,
+    order=None,
     **options,
 ):
     """Render P Gaussians; arguments as the library's rasterizer takes them, all float64.
 
     means2D (P, 2 or more) or None: its value is ignored, its gradient is dL/d(mean in px) * (W, H)
-    / 2.
+    / 2. `order` makes an order of every pixel (ray_reference.py): of what is drawn, front to back by the centres, and
+    the projection it makes steps, (H, W) indices of Gaussians, -1 for none; without it all pixels have that order.
     """
     height, width = settings.image_height, settings.image_width
     half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
@@ -579,25 +588,37 @@ def render(
         distance = torch.where(where, (value.detach() / threshold - 1).abs(), math.inf)
         torch.minimum(pixel_margin, distance.amin(0), out=pixel_margin)
 
-    for i in torch.argsort(depths.detach(), stable=True).tolist():
-        if not effects.near < depths[i] < effects.far or determinant(cov2d[i]) <= 0:
-            continue
+    drawn = [
+        i
+        for i in torch.argsort(depths.detach(), stable=True).tolist()
+        if effects.near < depths[i] < effects.far and determinant(cov2d[i]) > 0
+    ]
+    steps = drawn if order is None else order(drawn, Projection(means2d, cov2d, depths), opacities)
+    for i in steps:
+        if order is not None:
+            present, i = i >= 0, torch.where(i >= 0, i, drawn[0])
         offset = pixels - means2d[i]
-        if keep_offsets and offset.requires_grad:
+        if keep_offsets and order is None and offset.requires_grad:
             offset.retain_grad()
             offsets[i] = offset
         response = opacities[i] * sample_weights(offset, cov2d[i], footprint, moved=moved, **options)
+        if order is not None:
+            response = torch.where(present, response, 0.0)
         keep_away(response, ALPHA_MIN, ~stopped)
         keep_away(response, ALPHA_MAX, ~stopped)
         alpha = torch.where(response < ALPHA_MAX, response, ALPHA_MAX)
         blended = (alpha >= ALPHA_MIN) & ~stopped
-        touched[i] = (alpha >= ALPHA_MIN).any()
+        if order is None:
+            touched[i] = (alpha >= ALPHA_MIN).any()
+        else:
+            touched[i[(alpha >= ALPHA_MIN).any(0)]] = True
         alpha = torch.where(blended, alpha, 0.0)
         following = transmittance * (1 - alpha)
         keep_away(following, TRANSMITTANCE_MIN, blended)
         stopped = stopped | (following.detach() < TRANSMITTANCE_MIN)
         alpha = torch.where(stopped, 0.0, alpha)
-        color = color + (transmittance * alpha).mean(0) * colors[i][:, None, None]
+        shown = colors[i][:, None, None] if order is None else colors[i].movedim(-1, 0)
+        color = color + (transmittance * alpha).mean(0) * shown
         transmittance = transmittance * (1 - alpha)
         if moved is not None:
             half = 0.5 / math.isqrt(samples)  # nodes stay in their cells

@@ -600,6 +600,26 @@ def test_order_of_each_ray(small_scene):
     assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])
 
 
+def test_stillness(small_scene, run):
+    """Its exact order is that of the library for windows as long as lists, and its film is small."""
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    benchmark = importlib.import_module("stillness")
+    options = ["--scales", "1", "--crop", "24", "20", "--samples", "2", "--steps", "2", "--threads", "1"]
+    film = ["--film", str(small_scene / "film.png"), "--film-frames", "3", "--film-size", "24", "16"]
+    table = run(benchmark, *files_of(small_scene), *options, *film)
+    [result] = written(small_scene)["results"]
+    assert all(f"| 1/1 | {name} |" in table for name in benchmark.FOOTPRINTS)
+    for found in result["footprints"].values():
+        error, moves = zip(*(found["popping"][order] for order in benchmark.ORDERS))
+        assert all(math.isfinite(value) for value in (*error, *moves, *found["aliasing"]))
+        assert error[1] <= error[0] and max(error[1:]) < 1
+        assert all(of <= all_of for of, all_of in zip(moves, error))  # a deviation is at most the error itself
+    with image.open(small_scene / "film.png") as shown:
+        assert shown.n_frames == 4 and shown.size == (48, 16)
+    with pytest.raises(ValueError, match="footprints must be among point, mip, box:samples=1 and moment"):
+        benchmark.Filter.of("cumulant")
+
+
 def test_lens_accuracy(tmp_path, small_scene, run):
     """Rows with numbers; the library's samples are the program's; pictures; the number predicts errors of weights."""
     benchmark = importlib.import_module("lens_accuracy")

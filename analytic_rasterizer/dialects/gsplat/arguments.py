@@ -16,6 +16,7 @@ from ...checks import one_number, whole_number
 from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, resolve_footprint
 from ...render.autocast import way_out_of
 from ...render.effects import MAX_SH_DEGREE
+from ...render.order import CENTER, check_order
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED", "d", "Ed", "RGB-d", "RGB-Ed")
 """What `rasterization` renders: colours, accumulated or expected depth, distance along the ray, or both kinds."""
@@ -104,6 +105,9 @@ def checked(given: SimpleNamespace) -> Call:
     check_numbers(g.width, g.height, g.near_plane, g.far_plane, g.radius_clip, g.eps2d)
     sizes = check_scene(g.means, g.quats, g.scales, g.opacities, g.covars, g.viewmats, g.Ks)
     check_lens(g, sizes)
+    check_order(g.order)
+    if g.distributed and g.order != CENTER:
+        raise NotImplementedError(f"order must be {CENTER!r} with distributed=True, got {g.order!r}")
     colors = check_colors(g.means, sizes, g.colors, g.backgrounds, g.sh_degree, g.render_mode)
     if g.return_normals and g.covars is not None:
         raise ValueError("covars must be None where return_normals is True: normals are axes of quats")

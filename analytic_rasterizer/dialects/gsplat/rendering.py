@@ -12,6 +12,7 @@ import torch
 from ..._C import TILE
 from ...footprints import Footprint
 from ...render.autocast import widened
+from ...render.order import CENTER
 from .arguments import RASTERIZE_MODES, RENDER_MODES, TENSORS, Call, checked
 from .cameras import flat_cameras, prepared_cameras
 from .ranks import Sharing
@@ -66,12 +67,13 @@ def rasterization(
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
     footprint: str | Footprint | None = None,
+    order: str = CENTER,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Renders N Gaussians into C cameras, for every index of the leading dimensions `...`, of which there may be none.
 
-    The arguments up to viewmats_rs are those of gsplat 1.5.3, in its order. Those behind are what gsplat 1.6 added, and
-    footprint. Differentiable in all tensors, also in viewmats, Ks and coefficients of lenses. Floating tensors share
-    one device and dtype (float32; float64 on the CPU).
+    The arguments up to viewmats_rs are those of gsplat 1.5.3, in its order. Those behind are what gsplat 1.6 added,
+    footprint and order. Differentiable in all tensors, also in viewmats, Ks and coefficients of lenses. Floating
+    tensors share one device and dtype (float32; float64 on the CPU).
 
     Args:
         means: (..., N, 3) centres, world units.
@@ -122,6 +124,7 @@ def rasterization(
         renderer_config: Ignored: it chooses an implementation.
         footprint: See `resolve_footprint`. None: the one that `set_default_footprint` or the environment variable
             ANALYTIC_RASTERIZER_FOOTPRINT chose, or else the filter of rasterize_mode and eps2d.
+        order: "center", or along rays, see `Effects.order`.
 
     Returns:
         render_colors: (..., C, height, width, X): D channels, one of depth, or both.
@@ -212,4 +215,5 @@ def _scene(call: Call, sharing: Sharing | None) -> Scene:
         planes=planes if cut_later else (-math.inf, math.inf),
         radius_clip=given.radius_clip,
         footprint=call.footprint,
+        order=given.order,
     )

@@ -16,6 +16,7 @@ from torch.nn import functional
 from ...cameras.rotations import rotation_matrices
 from ...footprints import COMPENSATED, DILATED, Footprint
 from ...ops import Op
+from ...render.order import CENTER, key_of
 from .arguments import Mode, Signal, Sizes
 
 _AT_ONCE = 3  # channels of harmonics that `project` evaluates
@@ -38,7 +39,7 @@ class Scene:
         camera_model: One of `CAMERA_MODELS`.
         by_z: Whether splats are drawn in the order of z, and not of the distance.
         planes: Between which depths splats are drawn, where `project` has not looked at it.
-        radius_clip: As in `rasterization`.
+        radius_clip, order: As in `rasterization`.
     """
 
     sizes: Sizes
@@ -51,6 +52,7 @@ class Scene:
     planes: tuple[float, float]
     radius_clip: float
     footprint: Footprint
+    order: str
 
     def rows(
         self, mode: Mode, colors: Signal | None, extra: Signal | None, normals: bool, packed: bool
@@ -90,7 +92,7 @@ class Scene:
             tanfovy=[1.0] * count,
             scale_modifier=1.0,
             sh_degree=0 if shs is None else shs.degree,
-            footprint=self.footprint.key,
+            footprint=key_of(self.footprint, self.order),
             option=self.footprint.option,
             table=[] if packed else [*self.sizes.batch, self.sizes.cameras, self.sizes.gaussians],
             measured=True,
@@ -192,10 +194,11 @@ def composite(
         means2d_abs=means2d_abs,
         image_height=scene.height,
         image_width=scene.width,
-        footprint=scene.footprint.key,
+        footprint=key_of(scene.footprint, scene.order),
         option=scene.footprint.option,
         center=_CENTER,
         expected=expected,
+        slopes=None if scene.order == CENTER else rows["slopes"],
     )
     return image, alpha
 

@@ -92,7 +92,7 @@ enum class FrameGradient {
 /// I = 2 pi s1 s2 F(u / s1) F(v / s2), (u, v) = d in the eigenframe of Sigma. |S - CDF| < 4e-4.
 template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   static constexpr const char *kName = "analytic", *kPage = "window";
-  static constexpr bool kExpensive = true, kGeneric = kFrame == FrameGradient::kPaper;
+  static constexpr bool kExpensive = true, kGeneric = kFrame == FrameGradient::kPaper, kAlongRays = !kGeneric;
   static constexpr const char* kKey = kFrame == FrameGradient::kFrozen ? "analytic" : "analytic_paper";
   static constexpr Option kOption = {"frame_gradient", kFrame == FrameGradient::kFrozen ? "frozen" : "paper", 0,
                                      kFrame == FrameGradient::kFrozen};

@@ -12,6 +12,7 @@
 //   kOption       that option
 //   kReference    true: for comparisons; the CPU compiles it for one instruction set
 //   kGeneric      true: CUDA has only the slower kernels, for any number of channels
+//   kAlongRays    true: splats may be ordered along rays (core/order.h)
 //   kExpensive    true: CUDA finds out exactly which boxes of pixels a splat reaches
 //   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/footprint.wgsl.js, with the variance
 //                 of support_variance(); null: the page cannot draw F
@@ -175,7 +176,7 @@ struct FootprintDefaults {
   static constexpr std::nullptr_t kKey = nullptr;
   static constexpr const char* kPage = nullptr;
   static constexpr Option kOption = {};
-  static constexpr bool kReference = false, kGeneric = false, kExpensive = false;
+  static constexpr bool kReference = false, kGeneric = false, kExpensive = false, kAlongRays = false;
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0, kExtraLevel = 0;
   static constexpr bool kMoves = false;

@@ -89,6 +89,7 @@ template <int S> struct GaussianSample;
 /// Blending of all footprints that are S Gaussians, with any variance.
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
+  static constexpr bool kAlongRays = S <= 4;
   static constexpr double kReach = box_reach<S>();
   using Spread = std::conditional_t<S == 1, void, GaussianSample<S>>;
   template <typename T> using Shape = GaussianShape<T>;

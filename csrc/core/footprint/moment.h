@@ -27,7 +27,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   static constexpr double kVariance = kPixelVariance / S;                  ///< [px^2]
   static constexpr double kReach = 0.5;                                    ///< nodes stay in their cells
 
-  static constexpr bool kMoves = true;
+  static constexpr bool kMoves = true, kAlongRays = S <= 4;
   static constexpr double kMoveReach = 0.5 / kSide;
   static constexpr double kMoveGradUnit = kBase2 * kBase2;  ///< both z and the sums have kBase2 as a factor
 
