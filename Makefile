@@ -76,7 +76,7 @@ NPM := $(BUILD)/npm
 npm:
 	@[ -e $(NPM)/.installed ] || ! command -v npm > /dev/null || { mkdir -p $(NPM) && \
 	  npm install --silent --no-save --ignore-scripts --prefix $(NPM) @playcanvas/splat-transform@3.7.0 \
-	  gltf-validator@2.0.0-dev.3.10 && touch $(NPM)/.installed; } || echo "nothing from npm: going on without"
+	  gltf-validator@2.0.0-dev.3.10 @sparkjsdev/spark@2.2.0 three@0.187.0 && touch $(NPM)/.installed; } || echo "nothing from npm: going on without"
 
 # Built in place and not installed, so that a simple_knn that VENV may have stays what it is.
 test-simple-knn: $(VENV)/.installed

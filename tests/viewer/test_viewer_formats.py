@@ -1,14 +1,19 @@
 """The page shows one scene the same from every format, and an exported file alone, without a network, as it was."""
 
 import json
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
+import torch
 from chromium import WEBGL_FLAGS, facing, launch, open_page, page_of, pixels, wait_for, wait_for_frame, wait_until_ready
 from commands import command
-from npm import splat_transform
+from npm import MODULES, splat_transform
 from pages import assert_same, gaussians_of, psnr, random_scene, rendered, turned_view
 
 from analytic_rasterizer import io, viewer
+from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.io.axes import AXES, flipped
 from analytic_rasterizer.viewer.compressed import compress, decompress
 
@@ -67,6 +72,70 @@ def test_a_scene_looks_the_same_from_files_of_splat_transform(browser, tmp_path,
     scene = asymmetric_scene(name)
     io.save_scene(tmp_path / "scene.ply", scene)
     check(browser, splat_transform()(tmp_path / "scene.ply", tmp_path / name), scene, THEIRS[name])
+
+
+SPARK = """<link rel="icon" href="data:,">
+<script type="importmap">{"imports": {"three": "/three/build/three.module.js",
+  "three/addons/": "/three/examples/jsm/", "spark": "/@sparkjsdev/spark/dist/spark.module.js"}}</script>
+<script type="module">
+import { SplatMesh } from 'spark';
+window.read = async name => {
+  const mesh = new SplatMesh({ url: `/${name}` }), rows = [];
+  await mesh.initialized;
+  mesh.forEachSplat((i, mean, scales, q, opacity, { r, g, b }) =>
+    rows.push([mean.toArray(), scales.toArray(), [q.w, q.x, q.y, q.z], [opacity], [r, g, b]].flat()));
+  return rows;
+};
+</script>"""
+"""A page that reads a file as Spark does, which draws Gaussians for three.js."""
+
+
+@pytest.fixture
+def spark(browser, tmp_path):
+    """A function from a file's name in `tmp_path` to rows of what Spark reads: the (N, 14) numbers of `SPARK`."""
+    if not (MODULES / "@sparkjsdev").exists():
+        pytest.skip("needs npm's @sparkjsdev/spark and three: make npm")
+    (tmp_path / "index.html").write_text(SPARK)
+    for name in ("three", "@sparkjsdev"):
+        (tmp_path / name).symlink_to(MODULES / name)
+    handler = partial(QuietHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with open_page(browser, f"http://127.0.0.1:{server.server_port}") as page:
+            wait_for(page, "() => window.read !== undefined")
+            yield lambda name: torch.tensor(page.evaluate("name => read(name)", name), dtype=torch.float64)
+        server.shutdown()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+def test_spark_reads_one_scene_from_every_format(spark, tmp_path):
+    """Places, covariances and colours are those of the .ply. It holds scales and rotations in 8 bits."""
+    scene = asymmetric_scene("a.splat")
+    names = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat")
+    for name in names:
+        io.save_scene(tmp_path / name, scene)
+    rows = {name: spark(name) for name in names}
+    wanted = rows["a.ply"]
+    torch.testing.assert_close(wanted[:, :3], scene.means.double(), rtol=2**-10, atol=2**-10)  # half floats
+    for name in names:
+        found = rows[name]
+        assert len(found) == len(wanted)
+        index = torch.cdist(wanted[:, :3], found[:, :3]).argmin(1)
+        assert len(index.unique()) == len(wanted)
+        found = found[index]
+        torch.testing.assert_close(found[:, :3], wanted[:, :3], rtol=2**-10, atol=2**-6)
+        torch.testing.assert_close(found[:, 10:], wanted[:, 10:], rtol=0, atol=0.02)
+        apart = (covariances(found) - covariances(wanted)).flatten(1).norm(dim=1)
+        assert (apart / covariances(wanted).flatten(1).norm(dim=1)).max() < 0.25, name
+
+
+def covariances(rows):
+    rotations = rotation_matrices(rows[:, 6:10])
+    return rotations @ torch.diag_embed(rows[:, 3:6] ** 2) @ rotations.mT
 
 
 @pytest.mark.gate
