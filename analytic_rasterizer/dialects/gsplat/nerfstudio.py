@@ -2,7 +2,7 @@
 
 nerfstudio finds it by the entry point in pyproject.toml. Nothing else imports this module, which needs nerfstudio. The
 model is nerfstudio's own, and so are its options, its density control and its optimisers; only its calls of gsplat's
-`rasterization` go to this package. Use: docs/gsplat.md.
+`rasterization` go to this package. Use: docs/nerfstudio.md.
 """
 
 from __future__ import annotations
