@@ -386,7 +386,8 @@ def _masks(capture: Capture, items: list[Photograph], evidence: Evidence) -> Fin
     if masked:
         reason += f"; of the pixels that were looked at they leave out {1 - evidence.counted.mean().item():.1%}"
         if not evidence.counted.any():
-            reason += ", so that train has nothing to learn from"
+            reason += ", so that train has nothing to learn from; --masks none ignores them"
+            options = {}
     if capture.ignored_masks:
         about = f" ({capture.about_masks})"
         reason += f"; {capture.ignored_masks} files of masks belong to no convention, and are ignored{about}"

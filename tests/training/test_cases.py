@@ -73,7 +73,7 @@ CASES = {
         lambda f: (write(f), masks(f, "masks", 0)),
         r"expected pixels that count, got none in all 7 photographs, whose masks are black .*; --masks none ignores",
         fails=True,
-        inspect=COUNTED + r"100\.0%, so that train has nothing to learn from",
+        inspect=COUNTED + r"100\.0%, so that train has nothing to learn from; --masks none ignores them\n",
     ),
     "masks leave some photographs nothing": Case(
         lambda f: (write(f), masks(f, "masks", 255), masks(f, "masks", 0, count=4)),
