@@ -20,8 +20,8 @@ ITEM = re.compile(r"( {0,4})([-*+]|\d+\.) ")
 # Code, in which nothing is a link; or a link, whose text may have code in it.
 LINK = re.compile(r"`[^`]+`|(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)\s]+)\)")
 
-# Figures on white, which a dark page shows inverted.
-PLOTS = ("footprints", "errors", "pareto", "conventions")
+# By class: figures on white, which a dark page shows inverted; figures whose labels a phone can read.
+FIGURES = {"plot": ("footprints", "growth"), "small": ("moving", "conventions", "accuracy_time", "errors_weight")}
 NAMES = re.compile(r"(?<!\[)`([A-Za-z_][\w.]*)`")
 
 log = logging.getLogger("mkdocs.hooks.links")
@@ -48,9 +48,11 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_page_content(html, page, config, files):
-    """Plots get a class."""
-    plots = rf'<img(?=[^>]*src="[^"]*images/(?:{"|".join(PLOTS)})[^"]*")'
-    return re.sub(plots, '<img class="plot"', html)
+    """Figures get their class."""
+    for name, files_of in FIGURES.items():
+        figures = rf'<img(?=[^>]*src="[^"]*images/(?:{"|".join(files_of)})\.[^"]*")'
+        html = re.sub(figures, f'<img class="{name}"', html)
+    return html
 
 
 def with_names(markdown):

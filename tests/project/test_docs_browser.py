@@ -11,8 +11,21 @@ for name in ("mkdocs", "material", "mkdocstrings_handlers"):
     pytest.importorskip(name, reason="the site is built with mkdocs: make docs")
 
 WIDTHS = (390, 800, 1280)
-PAGES = ("index", "install", "footprints", "performance", "accuracy", "command-line", "training", "api/index")
+PAGES = (
+    "index",
+    "install",
+    "footprints",
+    "performance",
+    "accuracy",
+    "command-line",
+    "training",
+    "api/index",
+    "beside",
+    "conventions",
+    "troubleshooting",
+)
 LEGIBLE = 550  # px, of a figure whose labels are made for a page of 700
+SMALL = 340  # px, of one whose labels are made for a phone
 
 FAULTS = """() => {
   const seen = element => element.getClientRects().length > 0;
@@ -28,13 +41,14 @@ FAULTS = """() => {
     if (!seen(element)) continue;
     if (element.getBoundingClientRect().right > innerWidth && !scrolls(element)) note("cut off", element);
     if (element.tagName !== "IMG") continue;
-    if (element.width < Math.min(LEGIBLE, element.naturalWidth)) note("too small", element);
+    const least = element.matches(".small") ? SMALL : LEGIBLE;
+    if (element.width < Math.min(least, element.naturalWidth)) note("too small", element);
     if (!element.complete) note("not loaded", element);
   }
   for (const element of document.querySelectorAll(".md-content td code"))
     if (seen(element) && element.getClientRects().length > 1) note("broken in a word", element);
   return found;
-}""".replace("LEGIBLE", str(LEGIBLE))
+}""".replace("LEGIBLE", str(LEGIBLE)).replace("SMALL", str(SMALL))
 
 
 @pytest.fixture(scope="module")
