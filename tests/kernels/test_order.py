@@ -14,7 +14,7 @@ import ray_reference
 import reference
 import scenes
 import torch
-from scenes import Camera, name_of
+from scenes import VARIANTS, Camera, name_of
 from test_render_reference import (
     GRADIENT_TOLERANCE,
     IMAGE_TOLERANCE,
@@ -256,3 +256,37 @@ def test_cuda_refuses_it_by_name(device):
     scene = scenes.cast(tilted_scene(3), torch.float32, device)
     with pytest.raises(NotImplementedError, match="order 'ray' cannot be rendered on CUDA yet: render on the CPU"):
         SMALL.render(scene, ("point", {}), effects=RAYS)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+def test_the_truth_is_there_for_every_footprint(variant):
+    """Image and gradients in exact order: finite, and another picture than in the order of centres."""
+    camera, scene = Camera(image_height=5, image_width=6), tilted_scene(17, 12)
+    footprint, options = variant
+    settings = exact_settings(camera, torch.float64, ("point", {}))
+    leaves = scenes.leaves(scene)
+    expected, order = ray_reference.render(settings, **leaves, footprint=footprint, exact=True, **options)
+    assert order.shown.max() > 4
+    expected.color.sum().backward()
+    assert all(leaf.grad.isfinite().all() and leaf.grad.abs().max() > 0 for leaf in leaves.values())
+    center = reference.render(settings, **scene, footprint=footprint, **options).color
+    assert (expected.color - center).abs().max() > 1 / 255
+
+
+@each_along_rays
+def test_pictures_come_near_to_the_truth(variant):
+    """A tenth of the error of the order is left, of splats that are small beside their distance: depths are linear in
+    the picture, as the projection of the affine approximation is."""
+    scene = tilted_scene(3)
+    scene |= {"scales": 0.25 * scene["scales"], "means3D": 0.4 * scene["means3D"]}
+    camera = replace(SMALL, tanfovx=0.15, tanfovy=0.125, eye=(1.2, -0.8, -16.0))
+    footprint, options = variant
+    settings = exact_settings(camera, torch.float64, variant)
+    truth = ray_reference.render(settings, **scene, footprint=footprint, exact=True, **options)[0].color
+    rays, center = (
+        (camera.render(scene, variant, effects=ar.Effects(order=order))[0] - truth).square().mean().sqrt()
+        for order in (RAY, CENTER)
+    )
+    print(f"{rays:.1e} {center:.1e}")
+    assert center > 0.5 / 255
+    assert rays < center / 10

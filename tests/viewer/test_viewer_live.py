@@ -51,6 +51,20 @@ def test_frames_are_those_of_the_library(device, footprint):
     np.testing.assert_array_equal(frame, expected_frame(scene, view, footprint, background))
 
 
+def test_frames_have_an_order():
+    """Along rays where the footprint can be; others stay as they are, so that a browser can choose them."""
+    scene, background = make_scene(), (0.2, 0.4, 0.6)
+    view = frames.camera_view((0.1, -0.2, 0.3), (0.9, 0.1, -0.2, 0.05), FOV, 80, 60)
+    settings = view.settings(1.0, background, scene.sh_degree, "box:samples=1", effects=ar.Effects(order="ray"))
+    expected = render_stages(settings, **scene.arguments()).color.clamp(0, 1).mul(255).round().byte()
+    frame = live.render_frame(scene, view, "box:samples=1", background, "ray")
+    np.testing.assert_array_equal(frame, expected.permute(1, 2, 0).numpy())
+    center = live.render_frame(scene, view, "cumulant", background)
+    np.testing.assert_array_equal(live.render_frame(scene, view, "cumulant", background, "ray"), center)
+    with pytest.raises(ValueError, match="order must be one of center, ray, ray:32, got 'last'"):
+        live.LiveViewer(order="last")
+
+
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=needs_cuda)])
 def test_a_snapshot_waits_for_the_stream_that_fills_it(device):
     scene = make_scene().to(device)
