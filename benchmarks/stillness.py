@@ -266,7 +266,7 @@ def parse_arguments() -> argparse.Namespace:
     )
     add("--samples", type=int, default=4, metavar="N", help="of the integral, along a pixel's side (default: 4)")
     add("--film", metavar="FILE.png", help="also write an animated PNG")
-    add("--film-frames", type=int, default=12, metavar="N")
+    add("--film-frames", type=int, default=8, metavar="N")
     add("--film-size", nargs=2, type=int, default=[240, 160], metavar=("W", "H"))
     add("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
     add("--json", help="also write everything measured to this file")
