@@ -16,6 +16,9 @@ from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene, steps_of
 from ..analysis.plots import check_plot, save_plots
 from ..io.appearance import holds_scene
+from ..reconstruction import Photographs, find_photographs, forecast
+from ..reconstruction.folder import is_film
+from ..reconstruction.process import is_installed, missing_library
 from ..training.captures import IMAGES, is_capture
 from ..training.evidence import MOST_PHOTOGRAPHS
 from ..training.plan import plan_capture
@@ -49,7 +52,8 @@ def add_parser(subcommands) -> None:
         "effect changes and costs, and what the views show. A scene that was trained with 3DGS, or with the "
         "footprint point, is baked in memory first, and what that gains is printed. Of a folder of photographs with "
         "cameras it says, before any training, what lenses, exposures, blur, masks and the like they have, and which "
-        "options of train act on them.",
+        "options of train act on them. Of photographs without cameras, or a film, it says what train would do to find "
+        "them.",
     )
     add_scene(parser)
     add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
@@ -72,6 +76,10 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Inspects the scene, or the capture, and prints the report."""
+    photographs = _photographs(args)
+    if photographs is not None:
+        _inspect_photographs(args, photographs)
+        return
     if args.plot:  # raises before anything is looked at
         check_plot(args.plot)
         check_writable_file(args.plot)
@@ -110,14 +118,51 @@ def run(args) -> None:
         report.save_picture(args.plot)
     if args.json:
         data = {"trained_with": str(trained.footprint), **report.to_json(), "bake": gain and asdict(gain)}
-        text = json.dumps(data, indent=1, allow_nan=False) + "\n"
-        if args.json == "-":
-            print(text, end="")
+        if _write_json(args.json, data):
             return
-        io.write_text(args.json, text)
     if gain is not None:
         print(f"{gain.to_text()}\n\nwhat follows is for the baked scene: bake {shlex.quote(args.scene)} --out FILE\n")
     print(report.to_text())
+
+
+def _photographs(args) -> Photographs | None:
+    """SCENE, where it is photographs without cameras, or a film."""
+    path = Path(args.scene)
+    if args.cameras is not None or not (is_film(path) or path.is_dir()) or (path.is_dir() and holds_scene(path)):
+        return None
+    return find_photographs(path, args.images)
+
+
+def _inspect_photographs(args, photographs: Photographs) -> None:
+    """Says how train would find the cameras."""
+    _check_no_options_of_scenes(args, "photographs without cameras")
+    if args.plot:
+        raise ValueError(f"--plot is for scenes and captures, and {args.scene} has no cameras")
+    if args.threads is not None:
+        torch.set_num_threads(args.threads)
+    found = forecast(photographs, torch.get_num_threads())
+    if _write_json(args.json, found.to_json()):
+        return
+    print("\n".join(found.lines))
+    print("train SCENE --out DIR finds the cameras" if is_installed() else missing_library(photographs.source))
+
+
+def _check_no_options_of_scenes(args, kind: str) -> None:
+    given = [name for name, default in OF_SCENES.items() if getattr(args, name) != default]
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')} is for scenes, and {args.scene} is {kind}")
+
+
+def _write_json(path: str | None, content: dict) -> bool:
+    """Writes the content where --json says, and returns whether this is stdout."""
+    if path is None:
+        return False
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    if path == "-":
+        print(text, end="")
+        return True
+    io.write_text(path, text)
+    return False
 
 
 def _is_capture(args) -> bool:
@@ -130,9 +175,7 @@ def _is_capture(args) -> bool:
 
 def _inspect_capture(args) -> None:
     """Says what a capture calls for."""
-    given = [name for name, default in OF_SCENES.items() if getattr(args, name) != default]
-    if given:
-        raise ValueError(f"--{given[0].replace('_', '-')} is for scenes, and {args.scene} is a capture")
+    _check_no_options_of_scenes(args, "a capture")
     if args.threads is not None:
         torch.set_num_threads(args.threads)
     if args.json not in (None, "-"):
@@ -142,10 +185,5 @@ def _inspect_capture(args) -> None:
     say(*plan.notes)
     if args.plot:
         save_plots(args.plot, plots_of_capture(plan))
-    if args.json:
-        text = json.dumps(plan.to_json(), indent=1, allow_nan=False) + "\n"
-        if args.json == "-":
-            print(text, end="")
-            return
-        io.write_text(args.json, text)
-    print(plan.to_text())
+    if not _write_json(args.json, plan.to_json()):
+        print(plan.to_text())

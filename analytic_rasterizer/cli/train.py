@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import time
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
@@ -13,7 +14,10 @@ from .. import io
 from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
+from ..reconstruction import find_photographs, reconstruct
+from ..reconstruction.capture import is_finished
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
+from ..training.captures import CHOICES
 from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
@@ -30,6 +34,7 @@ from .arguments import (
 )
 from .launch import add_rank_options, is_launched, ranks_of
 
+CAPTURE = "capture"  # in DIR, of photographs without cameras
 TIMES_TEXT = "T is a time: a number of steps, or up to 1 a share of the training. See docs/training.md"
 
 
@@ -38,12 +43,13 @@ def add_parser(subcommands) -> None:
         "train",
         help="train a scene from photographs",
         description="Train Gaussians on the pictures of SCENE, a folder of a NeRF-synthetic scene, of the multi-scale "
-        "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Writes scene.ply, cameras.json, "
+        "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Cameras of photographs that have none, or "
+        "of a film, are found with COLMAP, in DIR/capture. Writes scene.ply, cameras.json, "
         "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C or SIGTERM saves and ends; --resume "
         "goes on. Under torchrun, several processes train one scene together.",
     )
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="folder of pictures with cameras")
+    add("scene", metavar="SCENE", help="folder of pictures with cameras, or without; or a film")
     add("--out", required=True, metavar="DIR", help="folder for the results")
     add_reading(parser, "SCENE")  # what is not given is None, for --resume
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
@@ -147,8 +153,14 @@ def run_on(ranks: Ranks, args) -> bool:
     if args.export and resolve_footprint((stored or options).footprint).name == DILATED:
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
     age = process_age()  # most of it is the import of torch
+    began = time.perf_counter()
+    reading = {name: getattr(args, name) for name in READING}
+    scene = capture_of(args, ranks)
+    if scene != args.scene:
+        reading["images"] = None  # which said where the photographs are
+    seconds = time.perf_counter() - began
     training = Run(
-        CaptureSource(args.scene, **{name: getattr(args, name) for name in READING}, points=args.points),
+        CaptureSource(scene, **reading, points=args.points),
         args.out,
         options,
         device=args.device,
@@ -161,7 +173,7 @@ def run_on(ranks: Ranks, args) -> bool:
         ranks=ranks,
     )
     if age is not None:
-        training.phases = {"start": age, **training.phases}
+        training.phases = {"start": age, **({"cameras": seconds} if scene != args.scene else {}), **training.phases}
     for note in training.notes if ranks.is_first else ():
         print(note, file=sys.stderr)
     limit, found = training.options.gaussian_limit, training.points_found
@@ -173,6 +185,21 @@ def run_on(ranks: Ranks, args) -> bool:
         complete = training.train(viewer)
         finish(training, complete, args)
     return complete
+
+
+def capture_of(args, ranks: Ranks) -> str | Path:
+    """The folder of SCENE's cameras: SCENE itself, or what is made of photographs that have none."""
+    of_scene = args.cameras is not None and (Path(args.scene) / args.cameras).exists()
+    if of_scene or find_photographs(args.scene, args.images) is None:
+        return args.scene
+    folder = Path(args.out) / CAPTURE
+    if ranks.world > 1 and not is_finished(args.scene, folder, args.images):
+        raise ValueError(f"{args.scene}: one process finds the cameras, got {ranks.world}: train without torchrun once")
+    choices = {name: getattr(args, name) or CHOICES[name][0] for name in ("masks", "missing")}
+    folder, notes = reconstruct(args.scene, folder, args.images, **choices)
+    for note in notes if ranks.is_first else ():
+        print(note, file=sys.stderr, flush=True)
+    return folder
 
 
 def finish(training: Run, complete: bool, args) -> None:

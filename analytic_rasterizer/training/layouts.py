@@ -111,7 +111,7 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, wit
         raise io.SceneError(f"{folder / images}: no such folder", other)
     files = PictureFiles(folder / images)
     masks = PictureFiles(folder / MASKS)
-    items = [Photograph(item.view, {1: files.find(item.name)}, mask=_mask_of(masks, item.name)) for item in registered]
+    items = [Photograph(item.view, {1: files.find(item.name)}, mask=mask_of(masks, item.name)) for item in registered]
     points = colmap.load_points(sparse) if with_points else None
     if points is None and with_points:
         points = initial_points(sparse)
@@ -121,7 +121,7 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, wit
     return Capture(*_split(folder, items, test_every), BLACK, points, starts_in_view=True, **ignored)
 
 
-def _mask_of(masks: PictureFiles, name: str) -> Path | None:
+def mask_of(masks: PictureFiles, name: str) -> Path | None:
     """The mask of a picture as COLMAP names it, NAME.png, or of the same name; None where there is none."""
     found = (masks.find(candidate) for candidate in (f"{name}.png", name))
     return next((path for path in found if path.is_file()), None)

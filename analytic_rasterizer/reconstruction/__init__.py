@@ -1,0 +1,12 @@
+"""Cameras of photographs that have none: COLMAP finds them, and a capture is made of both.
+
+    folder, notes = reconstruct("photographs", "out/capture")  # needs pip install analytic_rasterizer[colmap]
+
+`train` and `inspect` call it for a folder of photographs, or a film. pycolmap runs in a process of its own (`worker`).
+"""
+
+from .capture import reconstruct
+from .folder import Photographs, Shot, find_photographs
+from .forecast import forecast
+
+__all__ = ["Photographs", "Shot", "find_photographs", "forecast", "reconstruct"]
