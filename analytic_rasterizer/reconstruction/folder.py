@@ -12,7 +12,7 @@ from .. import io
 from ..io.errors import counted_files
 from ..io.images import opened_picture
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
-from ..training.captures import IMAGES, is_capture
+from ..training.captures import IMAGES, is_capture, reconstruction_below
 from ..training.layouts import MASK_FILE, MASK_FOLDER, MASKS, mask_of
 from .pairs import in_order
 
@@ -109,7 +109,7 @@ def find_photographs(source, images: str | None = None, masks: str | None = None
     source = Path(source)
     if is_film(source):
         return Photographs(source, source.parent, (source.name,))
-    if not source.is_dir() or is_capture(source):
+    if not source.is_dir() or is_capture(source) or reconstruction_below(source) is not None:
         return None
     folder = next((source / name for name in (images or IMAGES,) if (source / name).is_dir()), source)
     files = [path for path in folder.iterdir() if _is_photograph(path)] or [

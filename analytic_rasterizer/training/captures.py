@@ -13,7 +13,7 @@ from ..io.errors import counted_files, warn_of
 from ..render.effects import NEAR
 from . import colmap
 from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance, shown_share
-from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, has_splits, read_layout
+from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, count_pictures, has_splits, read_layout
 from .photographs import broken_files
 from .placement import offset_of
 from .undistortion import window_of
@@ -180,10 +180,15 @@ def read_cameras(
     if not places and parts is not None:
         raise colmap.incomplete(parts)
     if not places:
+        below, pictures = reconstruction_below(folder), count_pictures(folder)
+        found = f", got {pictures} pictures without cameras" if pictures else ""
+        advice = "train SCENE --out DIR finds the cameras of photographs with COLMAP"
+        if below is not None:
+            advice = f"there is a reconstruction in {below} (--cameras {below}, --images FOLDER)"
         raise io.SceneError(
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
-            "(.bin or .txt) in sparse/0",
-            *_elsewhere(folder),
+            f"(.bin or .txt) in sparse/0{found}",
+            *([advice] if pictures or below is not None else []),
         )
     found, passed_over = {}, {}
     for place in places:
@@ -294,11 +299,10 @@ def _models_in(folder: Path) -> list[Path]:
     return sorted(filter(colmap.is_reconstruction, numbered), key=lambda path: int(path.name))
 
 
-def _elsewhere(folder: Path) -> list[str]:
-    """Advice of an error that finds nothing in a folder: a reconstruction in a folder below."""
+def reconstruction_below(folder: Path) -> Path | None:
+    """A reconstruction in a folder below, where nobody looks for one, relative to `folder`."""
     below = [path for depth in range(1, SEARCH_DEPTH + 1) for path in sorted(folder.glob("/".join("*" * depth)))]
-    found = next((path.relative_to(folder) for path in below if colmap.is_reconstruction(path)), None)
-    return [] if found is None else [f"there is a reconstruction in {found} (--cameras {found}, --images FOLDER)"]
+    return next((path.relative_to(folder) for path in below if colmap.is_reconstruction(path)), None)
 
 
 def check_capture(folder: Path, capture: Capture) -> None:

@@ -106,7 +106,7 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, wit
     if not registered:
         raise io.SceneError(f"{sparse}: there are no pictures in the reconstruction")
     if not (folder / images).is_dir():
-        there = sorted(path.name for path in folder.iterdir() if path.is_dir() and _count_pictures(path))
+        there = sorted(path.name for path in folder.iterdir() if path.is_dir() and count_pictures(path))
         other = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
         raise io.SceneError(f"{folder / images}: no such folder", other)
     files = PictureFiles(folder / images)
@@ -251,7 +251,7 @@ def _split(folder: Path, items: list[Photograph], test_every: int) -> tuple[list
     return train, items[::test_every]
 
 
-def _count_pictures(folder: Path) -> int:
+def count_pictures(folder: Path) -> int:
     """Files of pictures in a folder and those below it."""
     return len(_pictures_in(folder))
 
