@@ -16,6 +16,7 @@ from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..reconstruction import find_photographs, reconstruct
 from ..reconstruction.capture import is_finished
+from ..reconstruction.folder import check_photographs
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES
 from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words
@@ -190,8 +191,10 @@ def run_on(ranks: Ranks, args) -> bool:
 def capture_of(args, ranks: Ranks) -> str | Path:
     """The folder of SCENE's cameras: SCENE itself, or what is made of photographs that have none."""
     of_scene = args.cameras is not None and (Path(args.scene) / args.cameras).exists()
-    if of_scene or find_photographs(args.scene, args.images) is None:
+    photographs = None if of_scene else find_photographs(args.scene, args.images)
+    if photographs is None:
         return args.scene
+    check_photographs(photographs, Path(args.out))
     folder = Path(args.out) / CAPTURE
     if ranks.world > 1 and not is_finished(args.scene, folder, args.images):
         raise ValueError(f"{args.scene}: one process finds the cameras, got {ranks.world}: train without torchrun once")

@@ -230,10 +230,8 @@ def _about(record: dict[str, Any]) -> tuple[str, ...]:
     models, count, without = record["models"], record["of"], record["without_camera"]
     said = [f"COLMAP found the cameras of {models[0]} of {count} photographs"]
     if len(models) > 1:
-        others = " and ".join(f"{number}" for number in models[1:])
-        said.append(
-            f"COLMAP made {len(models)} models that it could not join: the largest is used, others have {others}"
-        )
+        others = " and ".join(map(str, models[1:]))
+        said.append(f"COLMAP could not join {len(models)} models: the largest is used, the others have {others}")
     if without:
         named = ", ".join(without[:NAMED]) + (", .." if len(without) > NAMED else "")
         said.append(f"{len(without)} photographs have no camera and are left out: {named}")

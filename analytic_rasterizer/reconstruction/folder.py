@@ -144,7 +144,7 @@ def check_photographs(found: Photographs, out: Path) -> None:
     """Raises what is wrong before anything is done.
 
     Args:
-        out: The folder of results.
+        out: A folder that will be written.
 
     Raises:
         io.SceneError: Too few photographs.

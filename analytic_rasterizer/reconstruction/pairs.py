@@ -17,13 +17,12 @@ EARTH_RADIUS = 6_371_000.0  # m
 
 def in_order(names: Sequence[str]) -> list[str]:
     """The names in the order of their numbers: img2 comes before img10."""
-    return sorted(
-        names, key=lambda name: [(int(part), "") if part.isdecimal() else (-1, part) for part in _parts(name)]
-    )
+    return sorted(names, key=_key)
 
 
-def _parts(name: str) -> list[str]:
-    return [part for part in re.split(r"(\d+)", name) if part]
+def _key(name: str) -> list[tuple[bool, int, str]]:
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    return [(False, int(part), "") if part.isdecimal() else (True, 0, part) for part in parts]
 
 
 def pairs_of(names: Sequence[str], positions: Sequence[tuple[float, float, float] | None]) -> list[tuple[str, str]]:
