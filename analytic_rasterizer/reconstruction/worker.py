@@ -117,7 +117,7 @@ def match(job: dict) -> None:
 def _count_matched(job: dict) -> int:
     """Pairs of photographs that show the same points."""
     with pycolmap.Database.open(job["database"]) as database:
-        return database.num_verified_image_pairs()
+        return sum(count > 0 for count in database.read_two_view_geometry_num_inliers()[1])
 
 
 def build(job: dict) -> list[tuple]:

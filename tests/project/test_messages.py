@@ -34,6 +34,7 @@ PRINTED_BY = {
     **{f"training/{name}.py": READERS for name in ("extent", "evidence", "survey")},
     "training/report.py": (),  # what looks like options is its style sheet
     "training/": ("train",),
+    "reconstruction/": ("train",),
     "io/appearance.py": ("evaluate", "render", "view", "bake", "inspect"),
     "io/": tuple(COMMANDS),
     "analysis/planner.py": ("inspect",),
