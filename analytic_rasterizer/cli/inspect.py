@@ -16,8 +16,8 @@ from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene, steps_of
 from ..analysis.plots import check_plot, save_plots
 from ..io.appearance import holds_scene
-from ..reconstruction import Photographs, find_photographs, forecast
-from ..reconstruction.folder import is_film
+from ..reconstruction.folder import Photographs, find_photographs, is_film
+from ..reconstruction.forecast import forecast
 from ..reconstruction.process import is_installed, missing_library
 from ..training.captures import IMAGES, is_capture
 from ..training.evidence import MOST_PHOTOGRAPHS

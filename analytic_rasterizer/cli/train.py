@@ -14,9 +14,8 @@ from .. import io
 from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
-from ..reconstruction import find_photographs, reconstruct
-from ..reconstruction.capture import is_finished
-from ..reconstruction.folder import check_photographs
+from ..reconstruction.capture import is_finished, reconstruct
+from ..reconstruction.folder import check_photographs, find_photographs
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
 from ..training.captures import CHOICES
 from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words

@@ -5,8 +5,6 @@
 `train` and `inspect` call it for a folder of photographs, or a film. pycolmap runs in a process of its own (`worker`).
 """
 
-from .capture import reconstruct
-from .folder import Photographs, Shot, find_photographs
-from .forecast import forecast
+from .capture import Reconstructed, reconstruct
 
-__all__ = ["Photographs", "Shot", "find_photographs", "forecast", "reconstruct"]
+__all__ = ["Reconstructed", "reconstruct"]

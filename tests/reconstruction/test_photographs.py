@@ -16,9 +16,9 @@ from commands import refused
 from train_extra import image
 
 from analytic_rasterizer import io
-from analytic_rasterizer.reconstruction import capture, find_photographs, process
+from analytic_rasterizer.reconstruction import capture, process
 from analytic_rasterizer.reconstruction.films import sharpness
-from analytic_rasterizer.reconstruction.folder import FOCAL_LENGTH, PLACE
+from analytic_rasterizer.reconstruction.folder import FOCAL_LENGTH, PLACE, find_photographs
 from analytic_rasterizer.reconstruction.forecast import groups_of
 from analytic_rasterizer.reconstruction.pairs import MOST_EXHAUSTIVE, NEAREST, NEXT, in_order, pairs_of
 from analytic_rasterizer.training import captures
