@@ -69,7 +69,7 @@ class Photographs:
         return {name: (self.folder / name).stat().st_size for name in self.names}
 
     def mask(self, name: str) -> Path | None:
-        """The file of a photograph's mask; None: there is none."""
+        """The file of the mask of the photograph `name`; None: there is none."""
         return None if self.masks is None else mask_of(PictureFiles(self.masks), name)
 
     def shots(self) -> list[Shot]:
@@ -144,6 +144,7 @@ def check_photographs(found: Photographs, out: Path) -> None:
     """Raises what is wrong before anything is done.
 
     Args:
+        found: The photographs.
         out: A folder that will be written.
 
     Raises:

@@ -54,6 +54,7 @@ def forecast(found: Photographs, threads: int) -> Forecast:
     """Looks at the headers of the photographs, or of a film.
 
     Args:
+        found: The photographs.
         threads: That COLMAP will have.
 
     Raises:
