@@ -3,6 +3,8 @@
 // order, without its cost to the host.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/full.h>
 #include <ATen/ops/zeros.h>
 
@@ -32,6 +34,7 @@ RasterizeArguments scene_of(const PictureArguments& a, const Results& activated)
   static_cast<CameraNumbers<double>&>(scene) = a;
   static_cast<FootprintArguments&>(scene) = a;
   scene.bg = a.bg;
+  scene.images[kInverseDepth] = a.depth_target.has_value();
   scene.keep = true;
   return scene;
 }
@@ -44,18 +47,21 @@ struct SceneGrads {
 struct Rasterized {
   RasterizeArguments scene;
   Results results;
-  Tensor image, radii;
+  Tensor image, radii, inverse_depth;
 
   explicit Rasterized(const RasterizeArguments& a) : scene(a), results(rasterize(a)) {
     image = results[0].toTensor();
     radii = results[2].toTensor();
+    if (a.images[kInverseDepth]) inverse_depth = results[1].toTensorVector()[0];
   }
-  SceneGrads vjp(const Tensor& dL_dimage) const {
+  SceneGrads vjp(const Tensor& dL_dimage, const Tensor& dL_dinverse_depth) const {
     std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
     for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
     needs[1] = scene.means2D.has_value();
+    std::vector<OptionalTensor> dL_doutputs = {dL_dimage};
+    if (inverse_depth.defined()) dL_doutputs.push_back(dL_dinverse_depth);
     const std::vector<Tensor> g =
-        gradients_of(rasterize_vjp({{dL_dimage}, scene, results.back().toTensorVector(), needs}));
+        gradients_of(rasterize_vjp({dL_doutputs, scene, results.back().toTensorVector(), needs}));
     return {g[0], g[1], g[2], g[3], g[5], g[6]};
   }
 };
@@ -67,7 +73,7 @@ struct Sphere {
   SeamArguments seam;
   BlendArguments rows;
   Results projected, repeated, blended;
-  Tensor image, radii;
+  Tensor image, radii, inverse_depth;
 
   Sphere(const RasterizeArguments& a, double turn) : scene(a) {
     static_cast<SceneTensors<OptionalTensor>&>(camera) = a;
@@ -89,14 +95,16 @@ struct Sphere {
                              &seam.radii,   &seam.gaussian_ids, &seam.camera_ids, &seam.row_splits, &seam.dets};
     for (size_t k = 0; k < std::size(given); ++k) *given[k] = projected[k].toTensor();
     seam.turns = at::full({1}, turn, means2d.options());
+    const bool deep = a.images[kInverseDepth];
+    if (deep) seam.beside = seam.depths.reciprocal().unsqueeze(1);
     repeated = repeat_at_seam(seam);
 
     static_cast<FootprintArguments&>(rows) = a;
     rows.means2d = repeated[0].toTensor();
     rows.cov2d = repeated[1].toTensor();
     rows.opacities = repeated[2].toTensor();
-    rows.features = repeated[4].toTensor();
-    rows.background = a.bg.unsqueeze(0);
+    rows.features = deep ? at::cat({repeated[4].toTensor(), repeated[5].toTensor()}, 1) : repeated[4].toTensor();
+    rows.background = (deep ? at::constant_pad_nd(a.bg, {0, 1}) : a.bg).unsqueeze(0);
     rows.dets = repeated[9].toTensor();
     rows.row_splits = repeated[10].toTensor();
     if (columns() == 4) rows.means2d_abs = at::empty(rows.means2d.sizes(), means2d.options());
@@ -111,25 +119,36 @@ struct Sphere {
     rows.lists = bin(listed)[0].toTensorVector();
     blended = blend(rows);
     image = blended[0].toTensor()[0];
+    if (!deep) return;
+    inverse_depth = image[3];
+    image = image.narrow(0, 0, 3);
   }
   int64_t columns() const { return scene.means2D ? scene.means2D->size(1) : 0; }
 
-  SceneGrads vjp(const Tensor& dL_dimage) const {
-    const bool absolute = columns() == 4;
+  SceneGrads vjp(const Tensor& dL_dimage, const Tensor& dL_dinverse_depth) const {
+    const bool absolute = columns() == 4, deep = inverse_depth.defined();
+    const Tensor dL_dchannels = deep ? at::cat({dL_dimage, dL_dinverse_depth.unsqueeze(0)}) : dL_dimage;
     const std::vector<Tensor> of_rows =
-        gradients_of(blend_vjp({{dL_dimage.unsqueeze(0)},
+        gradients_of(blend_vjp({{dL_dchannels.unsqueeze(0)},
                                 rows,
                                 blended.back().toTensorVector(),
                                 {true, true, true, true, false, absolute, false, false}}));
     const std::vector<Tensor> saved = repeated.back().toTensorVector();
     std::vector<bool> needs(SeamArguments::kTensors, false);
     for (const size_t k : {0, 1, 2, 4}) needs[k] = true;  // means2d, cov2d, opacities, colors.
-    const std::vector<Tensor> of_splats = gradients_of(
-        repeat_at_seam_vjp({{of_rows[0], of_rows[1], of_rows[2], std::nullopt, of_rows[3]}, seam, saved, needs}));
+    needs[6] = deep;                                      // beside.
+    std::vector<OptionalTensor> dL_drepeated = {of_rows[0], of_rows[1], of_rows[2], std::nullopt, of_rows[3]};
+    if (deep) {
+      dL_drepeated[4] = of_rows[3].narrow(1, 0, 3).contiguous();
+      dL_drepeated.push_back(of_rows[3].narrow(1, 3, 1).contiguous());
+    }
+    const std::vector<Tensor> of_splats = gradients_of(repeat_at_seam_vjp({dL_drepeated, seam, saved, needs}));
+    OptionalTensor dL_ddepths;
+    if (deep) dL_ddepths = of_splats[6].mul(seam.beside->square()).neg().squeeze(1);
     needs.assign(kSceneTensors, false);                      // Of these all but means2D, and values.
     for (const size_t k : {0, 1, 2, 4, 5}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
     const std::vector<Tensor> g =
-        gradients_of(project_vjp({{of_splats[0], of_splats[1], of_splats[2], std::nullopt, of_splats[4]},
+        gradients_of(project_vjp({{of_splats[0], of_splats[1], of_splats[2], dL_ddepths, of_splats[4]},
                                   camera,
                                   projected.back().toTensorVector(),
                                   needs}));
@@ -205,6 +224,21 @@ struct Loss {
   }
 };
 
+/// The part of the loss that depths have, that of Huber, and its gradient. Undefined: none.
+struct DepthLoss {
+  Tensor value, dL_drendered;
+
+  DepthLoss(const PictureArguments& a, const Tensor& rendered) {
+    if (!a.depth_target) return;
+    const Tensor planes = rendered.unsqueeze(0), difference = averaged(planes, a.supersampling)[0].sub(*a.depth_target);
+    const Tensor slope = difference.div(a.depth_margin).clamp(-1, 1), weights = a.depth_shares->mul(a.depth_weight);
+    // In rows first, as in background_grad.
+    value = difference.sub(slope.mul(a.depth_margin / 2)).mul(slope).mul(weights).sum(1).sum();
+    const Tensor dL_daveraged = slope.mul(weights).mul(a.dL_dloss);
+    dL_drendered = averaged_vjp(dL_daveraged.unsqueeze(0), planes, a.supersampling)[0];
+  }
+};
+
 /// What the two ways of rendering have in common.
 template <class Rendering> Results gradients_through(const PictureArguments& a, const Rendering& render) {
   const ActivateArguments parameters = parameters_of(a);
@@ -218,8 +252,10 @@ template <class Rendering> Results gradients_through(const PictureArguments& a, 
   }
   const auto rendering = render(scene);
   Loss loss(a, rendering.image);
+  const DepthLoss depth(a, rendering.inverse_depth);
   if (parameters.has_penalty()) loss.value = loss.value.add(activated[3].toTensor());
-  SceneGrads grads = rendering.vjp(loss.dL_drendered);
+  if (depth.value.defined()) loss.value = loss.value.add(depth.value);
+  SceneGrads grads = rendering.vjp(loss.dL_drendered, depth.dL_drendered);
   if (a.filter_3d) {
     const std::vector<Tensor> of_filter =
         gradients_of(apply_3d_filter_vjp({{grads.scales, grads.opacities}, unfiltered, {}, {true, true, false}}));

@@ -95,6 +95,11 @@ struct PictureArguments : LossArguments, CameraNumbers<double>, FootprintArgumen
   OptionalTensor filter_3d;                     ///< (N,), that of `apply_3d_filter`.
   double opacity_weight = 0, scale_weight = 0;  ///< Of the mean opacity and scale, before the filter, in the loss.
   double turn = 0;                              ///< px of a turn in an equirectangular picture. Others have no seam: 0.
+  // Added to the loss: depth_weight * sum(depth_shares * h), where h is the absolute difference of inverse depths less
+  // half of depth_margin, and continued by a parabola within depth_margin.
+  OptionalTensor depth_target;  ///< (H, W) of the target, 1 / world units.
+  OptionalTensor depth_shares;  ///< (H, W), with it: how much each pixel counts.
+  double depth_weight = 0, depth_margin = 1;
 
   template <class Visit> void each(Visit&& visit) {
     visit("means", means);
@@ -115,6 +120,10 @@ struct PictureArguments : LossArguments, CameraNumbers<double>, FootprintArgumen
     visit("opacity_weight=0.0", opacity_weight);
     visit("scale_weight=0.0", scale_weight);
     visit("turn=0.0", turn);
+    visit("depth_target=None", depth_target);
+    visit("depth_shares=None", depth_shares);
+    visit("depth_weight=0.0", depth_weight);
+    visit("depth_margin=1.0", depth_margin);
   }
 };
 

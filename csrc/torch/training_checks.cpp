@@ -108,6 +108,13 @@ void check_weights(double opacity_weight, double scale_weight) {
                     "opacity_weight and scale_weight must be finite, got ", opacity_weight, " and ", scale_weight);
 }
 
+/// Raises unless a tensor has a number for each pixel of the target (3, H, W).
+void check_pixels(const Tensor& t, const char* name, const Like& like, const Tensor& target) {
+  like.check_type(t, name);
+  const std::vector<int64_t> pixels = {target.size(1), target.size(2)};
+  check_shape(t.sizes() == at::IntArrayRef(pixels), t, name, text_of(pixels));
+}
+
 /// `like`: of the rendering, which has this size.
 void check_loss(const LossArguments& a, const Like& like, int64_t height, int64_t width) {
   TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
@@ -124,10 +131,7 @@ void check_loss(const LossArguments& a, const Like& like, int64_t height, int64_
     like.check_type(*a.exposure, "exposure");
     check_shape(a.exposure->sizes() == at::IntArrayRef({3, 4}), *a.exposure, "exposure", "(3, 4)");
   }
-  if (!a.mask) return;
-  like.check_type(*a.mask, "mask");
-  const std::vector<int64_t> pixels = {image[1], image[2]};
-  check_shape(a.mask->sizes() == at::IntArrayRef(pixels), *a.mask, "mask", text_of(pixels));
+  if (a.mask) check_pixels(*a.mask, "mask", like, a.target);
 }
 
 }  // namespace
@@ -237,6 +241,14 @@ void check(PictureArguments& a) {
   like.check_rows_of(a.filter_3d, "filter_3d", {}, "(N,)");
   check_weights(a.opacity_weight, a.scale_weight);
   TORCH_CHECK_VALUE(std::isfinite(a.turn) && a.turn >= 0, "turn must be finite and not negative, got ", a.turn);
+  const bool deep = a.depth_target.has_value();
+  TORCH_CHECK_VALUE(deep == a.depth_shares.has_value(), "depth_target and depth_shares must be given together");
+  TORCH_CHECK_VALUE(std::isfinite(a.depth_weight) && a.depth_weight >= 0,
+                    "depth_weight must be finite and not negative, got ", a.depth_weight);
+  TORCH_CHECK_VALUE(std::isfinite(a.depth_margin) && a.depth_margin > 0,
+                    "depth_margin must be finite and positive, got ", a.depth_margin);
+  if (deep) check_pixels(*a.depth_target, "depth_target", like, a.target);
+  if (deep) check_pixels(*a.depth_shares, "depth_shares", like, a.target);
 }
 
 void check(RowsPictureArguments& a) {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, huber_loss
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.losses import l1_ssim
@@ -20,18 +22,28 @@ def widened(arguments: dict[str, torch.Tensor], filter_3d: torch.Tensor | None) 
     return arguments | dict(zip(("scales", "opacities"), made))
 
 
-def compared(settings, gaussians, means2D, target, *, times, exposure, mask, ssim_weight):
+def compared(settings, gaussians, means2D, target, *, times, exposure, mask, ssim_weight, depth=None):
     """The loss of a picture, the picture that is compared, and the radii.
 
     Args:
         settings: Of the rendering, which is `times` as large as the target.
         gaussians: Arguments of the rasterizer.
+        depth: depth_target, depth_shares, depth_weight and depth_margin of the op, by their names.
     """
-    picture, radii = ar.GaussianRasterizer(settings)(means2D=means2D, **gaussians)
+    loss = 0.0
+    if depth is None:
+        picture, radii = ar.GaussianRasterizer(settings)(means2D=means2D, **gaussians)
+    else:
+        effects = replace(settings.effects or ar.Effects(), inverse_depth=True)
+        deep = settings._replace(effects=effects)
+        picture, radii, outputs = ar.GaussianRasterizer(deep)(means2D=means2D, **gaussians)
+        shown, margin = avg_pool2d(outputs.inverse_depth, times)[0], depth["depth_margin"]
+        differences = huber_loss(shown, depth["depth_target"], reduction="none", delta=margin) / margin
+        loss = depth["depth_weight"] * (differences * depth["depth_shares"]).sum()
     picture = avg_pool2d(picture, times)
     if exposure is not None:
         picture = torch.einsum("ij,jhw->ihw", exposure[:, :3], picture) + exposure[:, 3, None, None]
-    return l1_ssim(picture, target, ssim_weight, mask), picture, radii
+    return l1_ssim(picture, target, ssim_weight, mask) + loss, picture, radii
 
 
 def by_autograd(trainer) -> dict[str, torch.Tensor]:
@@ -54,6 +66,7 @@ def by_autograd(trainer) -> dict[str, torch.Tensor]:
         target = trainer.pictures.target(shown.scale, shown.view, shown.background)
         mask, weight = trainer.pictures.mask(shown.scale, shown.view), options.ssim_weight
         how = {"times": times, "exposure": matrix, "mask": mask, "ssim_weight": weight}
+        how["depth"] = trainer._depth(shown) or None
         losses.append(compared(shown.settings._replace(**size), shown_as, leaves[-1], target, **how)[0])
     opacity_weight, scale_weight = options.regularizers
     penalty = opacity_weight * arguments["opacities"].mean() + scale_weight * arguments["scales"].mean()

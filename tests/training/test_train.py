@@ -449,7 +449,7 @@ def test_a_step_has_the_gradients_of_autograd(device, synthetic, tmp_path, optio
 
 
 FIELDS = ("means", "log_scales", "quats", "logit_opacities", "shs")
-PARTS = ("", "mask", "exposure", "filter", "supersampling", "regularizers", "all")
+PARTS = ("", "mask", "exposure", "filter", "supersampling", "regularizers", "depth", "all")
 
 
 def settings_of(lens, device, dtype=torch.float32):
@@ -471,6 +471,12 @@ def picture_arguments(device, parts="", lens=None, dtype=torch.float32, **change
         "exposure": {"exposure": torch.eye(3, 4) + 0.1 * torch.rand(3, 4, generator=generator)},
         "filter": {"filter_3d": 0.3 * torch.rand(len(log_scales), generator=generator)},
         "regularizers": {"opacity_weight": 0.3, "scale_weight": 0.2},
+        "depth": {
+            "depth_target": 0.2 + 0.2 * torch.rand(size, generator=generator),
+            "depth_shares": torch.rand(size, generator=generator),
+            "depth_weight": 0.01,
+            "depth_margin": 0.05,
+        },
     }
     given = dict(zip(FIELDS, gaussians._replace(log_scales=log_scales)))
     given |= {"dL_dloss": torch.tensor(0.75), "bg": torch.full((3,), 0.2), "exposure": None, "mask": None}
@@ -499,6 +505,8 @@ def test_gradients_of_a_picture_are_those_of_autograd(device, lens, parts, colum
     shown = widened(arguments, given.get("filter_3d"))
     exposure = given["exposure"] if given["exposure"] is None else given["exposure"].clone().requires_grad_()
     how = {"times": times, "exposure": exposure, "mask": given["mask"], "ssim_weight": given["ssim_weight"]}
+    if "depth_target" in given:
+        how["depth"] = {name: value for name, value in given.items() if name.startswith("depth_")}
     settings = settings_of(lens, device)._replace(bg=given["bg"])
     expected, image, expected_radii = compared(settings, shown, means2D, given["target"], **how)
     expected = expected + weights[0] * arguments["opacities"].mean() + weights[1] * arguments["scales"].mean()
@@ -596,6 +604,20 @@ def test_threads_change_no_bit_of_the_regularizers():
         ({"supersampling": 0}, ValueError, "supersampling must be at least 1 and divide"),
         ({"supersampling": 2}, ValueError, r"target must have shape \(3, 16, 16\), got \(3, 32, 32\)"),
         ({"scale_weight": math.nan}, ValueError, "opacity_weight and scale_weight must be finite, got 0 and nan"),
+        ({"depth_target": torch.zeros(32, 32)}, ValueError, "depth_target and depth_shares must be given together"),
+        ({"depth_shares": torch.zeros(32, 32)}, ValueError, "depth_target and depth_shares must be given together"),
+        ({"depth_weight": -1.0}, ValueError, "depth_weight must be finite and not negative, got -1"),
+        ({"depth_margin": 0.0}, ValueError, "depth_margin must be finite and positive, got 0"),
+        (
+            {"depth_target": torch.zeros(16, 32), "depth_shares": torch.zeros(32, 32)},
+            ValueError,
+            r"depth_target must have shape \(32, 32\), got \(16, 32\)",
+        ),
+        (
+            {"depth_target": torch.zeros(32, 32), "depth_shares": torch.zeros(32, 32).double()},
+            TypeError,
+            "depth_shares must have the dtype of means",
+        ),
     ],
 )
 def test_errors_of_picture_gradients(changed, error, message):
