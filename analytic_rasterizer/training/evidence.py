@@ -193,7 +193,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     inside = ((pixels >= 0) & (pixels < pixels.new_tensor([width, height]))).all(1)
     depth = view.depths_of(in_camera)
     visible = inside.nonzero()[:, 0]
-    visible = visible[_in_front(pixels[visible], depth[visible], width, height) & chosen[visible]]
+    visible = visible[in_front(pixels[visible], depth[visible], width, height) & chosen[visible]]
     observed = visible
     if tracks:
         observed = tracks.get(view.name, none)
@@ -205,10 +205,11 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     return _Look(transparent, visible, intervals, observed[opaque], sampled[opaque], unknown, counted)
 
 
-def _in_front(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
-    """(N,) bool: whether a point is about as near as the nearest in its cell of a picture of this size."""
-    columns, rows = width // CELL + 1, height // CELL + 1
-    column, row = (pixels / CELL).long().unbind(1)
+def in_front(pixels: Tensor, depth: Tensor, width: int, height: int, size: float = CELL) -> Tensor:
+    """(N,) bool: whether a point is about as near as the nearest in its cell of a picture of this size. Cells are of
+    `size` px."""
+    columns, rows = int(width / size) + 1, int(height / size) + 1
+    column, row = (pixels / size).long().unbind(1)
     cell = row * columns + column
     nearest = depth.new_full((rows * columns,), math.inf).scatter_reduce(0, cell, depth, "amin")
     return depth <= DEPTH_TOLERANCE * nearest[cell]

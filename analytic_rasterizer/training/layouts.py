@@ -20,6 +20,7 @@ from ..io import BLACK, WHITE, load_points
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
 from ..io.views import checked_pixels, checked_pose, checked_positive, read_views
 from . import colmap
+from .depth_files import DepthFile, DepthFolder, depth_of_frame
 
 MASKS = "masks"  # COLMAP's folder of them, beside that of the pictures
 # Of folders, as Masks or dynamic_masks, and of files, as a_mask.jpg or a.jpg.mask.png.
@@ -36,6 +37,7 @@ class Photograph(NamedTuple):
         undistort: Whether `load_pictures` resamples the picture to that of a pinhole.
         mask: The file of its mask, whose black pixels do not count; None: all pixels count.
         alpha_is_mask: Whether transparent pixels do not count; otherwise a background is seen through them.
+        depth: Its depth map, there or not; None: the capture has none of it.
     """
 
     view: io.View
@@ -43,6 +45,7 @@ class Photograph(NamedTuple):
     undistort: bool = False
     mask: Path | None = None
     alpha_is_mask: bool = False
+    depth: DepthFile | None = None
 
 
 class Capture(NamedTuple):
@@ -110,8 +113,11 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int, wit
         other = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
         raise io.SceneError(f"{folder / images}: no such folder", other)
     files = PictureFiles(folder / images)
-    masks = PictureFiles(folder / MASKS)
-    items = [Photograph(item.view, {1: files.find(item.name)}, mask=mask_of(masks, item.name)) for item in registered]
+    masks, depths = PictureFiles(folder / MASKS), DepthFolder(folder, sparse)
+    items = [
+        Photograph(view, {1: files.find(name)}, mask=mask_of(masks, name), depth=depths.find(name))
+        for name, view, _ in registered
+    ]
     points = colmap.load_points(sparse) if with_points else None
     if points is None and with_points:
         points = initial_points(sparse)
@@ -141,8 +147,8 @@ def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
         mask = frame.get("mask_path")
         if mask is not None and not isinstance(mask, str):
             raise io.SceneError(f"{path}: frame {i}: mask_path must name a picture beside the file, got {mask!s}")
-        mask = None if mask is None else files.find(mask)
-        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, mask=mask))
+        mask, depth = None if mask is None else files.find(mask), depth_of_frame(frame, files, f"{path}: frame {i}")
+        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, mask=mask, depth=depth))
     return found, data
 
 

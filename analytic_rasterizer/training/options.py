@@ -215,6 +215,11 @@ class TrainingOptions:
     noise: float = MonteCarloOptions.noise
     opacity_weight: float = LossOptions.opacity_weight
     scale_weight: float = LossOptions.scale_weight
+    depth: str = LossOptions.depth
+    depth_weight: float = LossOptions.depth_weight
+    depth_weight_end: float = LossOptions.depth_weight_end
+    depth_fit: str = LossOptions.depth_fit
+    depth_unit: float = LossOptions.depth_unit
 
     def __post_init__(self):
         given = dict(vars(self))

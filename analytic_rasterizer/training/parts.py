@@ -14,10 +14,13 @@ from ..density import GradientOptions
 from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.images import BACKGROUNDS
 from ..render.order import CENTER, ORDERS, key_of
+from .depth_files import UNIT
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 EFFECTS = ("auto", "none")
 EXPOSURES = ("none", "affine")
+DEPTHS = ("none", "points", "maps")
+DEPTH_FITS = ("auto", "none")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 RANDOM_BACKGROUND = "random"
 NO_FOOTPRINT = "none"  # of the beginning, other than that of the end
@@ -261,6 +264,39 @@ class LossOptions(Options):
     )
     scale_weight: float = option(
         -1.0, 'Weight of the mean scale in the loss; -1: 0.01 for "mcmc", otherwise 0.', WEIGHT, metavar="WEIGHT"
+    )
+    depth: str = option(
+        "none",
+        'Measured depths that inverse depths of the rendering are compared with: "points", those of the points that '
+        'each photograph shows; "maps", the depth maps beside the photographs; "none".',
+        one_of(DEPTHS),
+        main=True,
+    )
+    depth_weight: float = option(
+        0.1,
+        "Weight in the loss, at the start, of the mean difference of inverse depths, times the median depth of each "
+        "photograph.",
+        NOT_NEGATIVE,
+        metavar="WEIGHT",
+    )
+    depth_weight_end: float = option(
+        0.01,
+        "The same at the end; in between it changes exponentially, or evenly where one of the two is 0.",
+        NOT_NEGATIVE,
+        metavar="WEIGHT",
+    )
+    depth_fit: str = option(
+        "auto",
+        '"auto": scale and shift of the inverse depths of each map are fitted to the points that its photograph shows, '
+        'where it shows 20 or more. "none": they are those of the files.',
+        one_of(DEPTH_FITS),
+    )
+    depth_unit: float = option(
+        UNIT,
+        "World units of 1 in the depth maps that transforms.json names, `depth_unit_scale_factor` of nerfstudio. Maps "
+        "of inverse depths have none.",
+        POSITIVE,
+        metavar="LENGTH",
     )
 
 

@@ -31,11 +31,11 @@ class Header(NamedTuple):
 
     def fits(self, view: io.View) -> bool:
         """Whether the picture can be that of a camera, at this or another scale."""
-        return _is_reduced(self.width, self.height, view.width, view.height)
+        return is_reduced(self.width, self.height, view.width, view.height)
 
     def fits_turned(self, view: io.View) -> bool:
         """Whether it can be after a quarter turn."""
-        return _is_reduced(self.height, self.width, view.width, view.height)
+        return is_reduced(self.height, self.width, view.width, view.height)
 
     def is_cut(self, view: io.View) -> bool:
         """Whether it has one side of its camera's picture, and not the other."""
@@ -53,10 +53,12 @@ class Stored(NamedTuple):
     rgba: Tensor  # (H, W, 4) uint8 of straight alpha
     orientation: int  # how the camera was held, as EXIF counts it
     mask: Tensor | None = None  # (H, W) uint8, 255 where pixels count
+    depth: Tensor | None = None  # (2, h, w) float32 of `depth_planes`, of any size
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Stored:
         """With other tensors."""
-        return self._replace(rgba=change(self.rgba), mask=None if self.mask is None else change(self.mask))
+        mask, depth = (None if tensor is None else change(tensor) for tensor in (self.mask, self.depth))
+        return self._replace(rgba=change(self.rgba), mask=mask, depth=depth)
 
     @property
     def header(self) -> Header:
@@ -74,7 +76,7 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
     with opened_picture(path, "train") as opened:
         counts = _counts(opened)
     own_height, own_width = counts.shape
-    if not (_is_reduced(own_width, own_height, width, height) or _is_reduced(width, height, own_width, own_height)):
+    if not (is_reduced(own_width, own_height, width, height) or is_reduced(width, height, own_width, own_height)):
         raise io.SceneError(
             f"{path}: expected a mask of the shape of its picture, {width} x {height} px, got {own_width} x "
             f"{own_height}"
@@ -206,7 +208,7 @@ def read_size(path: Path) -> tuple[int, int]:
         return opened.size
 
 
-def _is_reduced(width: int, height: int, full_width: int, full_height: int) -> bool:
+def is_reduced(width: int, height: int, full_width: int, full_height: int) -> bool:
     """Whether a picture can be another with so many pixels at another scale, both sides rounded up or down."""
     lowest = max((width - 1) / full_width, (height - 1) / full_height)
     return lowest < min((width + 1) / full_width, (height + 1) / full_height)

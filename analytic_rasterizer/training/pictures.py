@@ -20,13 +20,15 @@ from ..io.errors import SceneWarning, counted_files, naming
 from ..render.order import CENTER
 from ..render.settings import GaussianRasterizationSettings, in_order
 from .captures import Photograph
+from .depth import DepthMap, depth_planes
 from .parts import check_scales
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size, unreadable_pictures
+from .reduction import reduce, reduced_depths
 from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens
 
 NAMED = 3  # files in a warning
-LEAST_SHARE = 1 / 512  # of a pixel that counts: less rounds to none
+DEPTH_BYTES = 4  # of a pixel
 
 
 class Pictures(NamedTuple):
@@ -42,6 +44,9 @@ class Pictures(NamedTuple):
             in all views if it stands for the dict.
         store: Where `load_pictures` has put them; None: colours and masks are lists.
         shares: For every view, the share of its finest picture that counts; empty: not known.
+        depths: By scale, for every view: (2, H, W) float16, inverse depths times the reference of its `DepthMap`, and
+            how much each pixel counts; None: none is known, in all views if it stands for the dict.
+        depth_sums: By scale, for every view: the sum of the latter.
     """
 
     views: list[io.View]
@@ -50,6 +55,8 @@ class Pictures(NamedTuple):
     masks: dict[int, Sequence[Tensor | None]] | None = None
     store: Store | None = None
     shares: Sequence[float] = ()
+    depths: dict[int, Sequence[Tensor | None]] | None = None
+    depth_sums: dict[int, list[float]] | None = None
 
     @property
     def horizon(self) -> int:
@@ -83,6 +90,11 @@ class Pictures(NamedTuple):
         stored = None if self.masks is None else self.masks[scale][view]
         return None if stored is None else self._on_device(stored, scale, view).float() / 255
 
+    def depth(self, scale: int, view: int) -> Tensor | None:
+        """(2, H, W) float32 on the device: `depths` of a `view` at a `scale`. None: nothing is known."""
+        stored = None if self.depths is None else self.depths[scale][view]
+        return None if stored is None else self._on_device(stored, scale, view).float()
+
     def _on_device(self, stored: Tensor, scale: int, view: int) -> Tensor:
         return stored.to(self.settings[scale][view].viewmatrix.device, non_blocking=True)
 
@@ -104,8 +116,9 @@ def load_pictures(
     device: str | torch.device,
     downsampling: str = "box",
     memory: PictureMemory | None = None,
+    maps: Sequence[DepthMap | None] | None = None,
 ) -> Pictures:
-    """Reads photographs and reduces them.
+    """Reads photographs, and reduces them.
 
     A picture that is to be undistorted is resampled to that of a pinhole, see `undistortion.without_lens`. All pictures
     are cut about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
@@ -119,6 +132,7 @@ def load_pictures(
         device: Of the pictures and the settings.
         downsampling: As in `TrainingOptions`.
         memory: How much of it pictures may take; None: the shares of `PictureMemory`.
+        maps: Depth maps of the photographs; None: none has any.
 
     Warns of pictures that EXIF says to turn, unless their sizes show that they fit their cameras as they are stored.
     They are not turned. Warns of pictures of another shape than their cameras', see `fitted`.
@@ -133,12 +147,13 @@ def load_pictures(
     memory.check(device)
     recipe = Recipe(math.lcm(*scales), background, downsampling)
     shapes = read_sizes(items)
-    sizes, pixels = _sizes(shapes, scales, recipe)
+    maps = [None] * len(items) if maps is None else maps
+    sizes, pixels = _sizes(shapes, scales, recipe, maps)
     free = free_memory(device)
     plan = plan_places(sizes, pixels, limits_of(memory, free, device), free, device, memory.processes)
-    views, settings, kept = [], {scale: [] for scale in scales}, {}
+    views, settings, kept, sums = [], {scale: [] for scale in scales}, {}, {scale: [] for scale in scales}
     to_turn, errors, shares = [], [], []
-    with closing(_read_ahead(items, scales, plan.threads)) as ahead:
+    with closing(_read_ahead(items, maps, scales, plan.threads)) as ahead:
         for number, (item, files) in enumerate(zip(items, ahead)):
             if isinstance(files, io.SceneError):
                 errors.append(files)
@@ -157,6 +172,8 @@ def load_pictures(
                 # In fractions: the cut makes both sizes multiples of the scale.
                 behind = (0.0, 0.0, 0.0) if background is None else background
                 settings[scale].append(view.settings(1 / scale, behind, device=device))
+                planes = of_scales[scale].depth
+                sums[scale].append(0.0 if planes is None else planes[1].float().sum().item())
     if errors:
         raise unreadable_pictures(errors, len(items))
     warn_of_shapes(shapes)
@@ -170,17 +187,21 @@ def load_pictures(
         )
 
     def read(key: Key, pinned: Callable[[Tensor], Tensor]) -> dict[int, Stored]:
-        return {scale: stored.map(pinned) for scale, stored in _read_files(items[key[1]], key[:1]).items()}
+        files = _read_files(items[key[1]], key[:1], maps[key[1]])
+        return {scale: stored.map(pinned) for scale, stored in files.items()}
 
     def make(key: Key, files: dict[int, Stored], moved: Callable[[Tensor], Tensor]) -> Made:
         return _make(items[key[1]], files, key[:1], recipe, moved)[1][key[0]]
 
     store = Store(device, plan, kept, read, make)
     if plan.ahead:
-        fields = columns(store, scales, len(items))
+        colors, masks, depths = columns(store, scales, len(items))
     else:
-        fields = ({scale: [kept[scale, i][k] for i in range(len(items))] for scale in scales} for k in range(2))
-    return Pictures(views, settings, *fields, store, shares)
+        colors, masks, depths = (
+            {scale: [kept[scale, i][k] for i in range(len(items))] for scale in scales}
+            for k in range(len(Made._fields))
+        )
+    return Pictures(views, settings, colors, masks, store, shares, depths if any(maps) else None, sums)
 
 
 class Recipe(NamedTuple):
@@ -212,7 +233,7 @@ def read_sizes(items: list[Photograph]) -> list[tuple[Photograph, Header]]:
 
 
 def _sizes(
-    shapes: list[tuple[Photograph, Header]], scales: tuple[int, ...], recipe: Recipe
+    shapes: list[tuple[Photograph, Header]], scales: tuple[int, ...], recipe: Recipe, maps: Sequence[DepthMap | None]
 ) -> tuple[dict[Key, int], int]:
     """Bytes of every picture, and pixels of the largest photograph, by what the files say before they are decoded."""
     sizes, pixels = {}, 0
@@ -222,7 +243,7 @@ def _sizes(
         view = _view_of(item, header.width, header.height)
         with naming(item.files[1]):
             width, height = window_of(view)[2:4] if item.undistort else (view.width, view.height)
-        planes = channels + (item.mask is not None or item.alpha_is_mask)
+        planes = channels + (item.mask is not None or item.alpha_is_mask) + DEPTH_BYTES * (maps[number] is not None)
         for scale in scales:
             lengths = ((length - length % recipe.multiple) // scale for length in (width, height))
             sizes[scale, number] = planes * math.prod(lengths)
@@ -265,7 +286,17 @@ def _make(
         if whole.shape[:2] != (view.height // stored, view.width // stored):
             raise io.SceneError(f"{item.files[stored]}: expected {view.width // stored} x {view.height // stored} px")
         made[scale] = Made(*reduce(whole, scale // stored, recipe.background, recipe.downsampling, whole_mask))
+    if files[1].depth is not None:
+        planes = _depths_beside(moved(files[1].depth), files[1].header, view)
+        made = {scale: its._replace(depth=reduced_depths(planes, scale, mask)) for scale, its in made.items()}
     return view, made
+
+
+def _depths_beside(planes: Tensor, header: Header, view: io.View) -> Tensor:
+    """(2, H, W) of `depth_planes`, in the pixels of a view that is cut about the centre of its photograph."""
+    planes = functional.interpolate(planes[None], (header.height, header.width), mode="area")[0]
+    left, top = (header.width - view.width) // 2, (header.height - view.height) // 2
+    return planes[:, top : top + view.height, left : left + view.width]
 
 
 def _stored(stored: Stored, item: Photograph, moved: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor | None]:
@@ -275,22 +306,22 @@ def _stored(stored: Stored, item: Photograph, moved: Callable[[Tensor], Tensor])
 
 
 def _read_ahead(
-    items: list[Photograph], scales: tuple[int, ...], threads: int
+    items: list[Photograph], maps: Sequence[DepthMap | None], scales: tuple[int, ...], threads: int
 ) -> Iterator[dict[int, Stored] | io.SceneError]:
     """What is stored of each photograph at every scale that is needed, or why it cannot be read. Threads read some
     photographs ahead."""
 
-    def read(item: Photograph) -> dict[int, Stored] | io.SceneError:
+    def read(item: Photograph, depth: DepthMap | None) -> dict[int, Stored] | io.SceneError:
         try:
-            return _read_files(item, scales)
+            return _read_files(item, scales, depth)
         except io.SceneError as error:
             return error
 
     with ThreadPoolExecutor(threads, "pictures") as pool:
         ahead: deque = deque()
         try:
-            for item in items:
-                ahead.append(pool.submit(read, item))
+            for item, depth in zip(items, maps):
+                ahead.append(pool.submit(read, item, depth))
                 if len(ahead) > threads:  # more would only wait in memory
                     yield ahead.popleft().result()
             while ahead:
@@ -299,14 +330,16 @@ def _read_ahead(
             pool.shutdown(cancel_futures=True)
 
 
-def _read_files(item: Photograph, scales: tuple[int, ...]) -> dict[int, Stored]:
+def _read_files(item: Photograph, scales: tuple[int, ...], depth: DepthMap | None) -> dict[int, Stored]:
     found = {scale: read_file(item.files[scale]) for scale in {1, *scales} if scale in item.files}
-    if item.mask is None:
-        return found
-    return {
-        scale: stored._replace(mask=read_mask(item.mask, stored.rgba.shape[1], stored.rgba.shape[0]))
-        for scale, stored in found.items()
-    }
+    if item.mask is not None:
+        found = {
+            scale: stored._replace(mask=read_mask(item.mask, stored.rgba.shape[1], stored.rgba.shape[0]))
+            for scale, stored in found.items()
+        }
+    if depth is not None:
+        found[1] = found[1]._replace(depth=depth_planes(depth, item.view))
+    return found
 
 
 def fitted(
@@ -380,58 +413,3 @@ def _undistorted(rgba: Tensor, mask: Tensor | None, view: io.View) -> tuple[io.V
     share = masks[..., 0]
     alpha = torch.where(share > 0, 255 * seen[..., 3].float() / share, 0).clamp_max(255).round().byte()
     return pinhole, torch.cat([seen[..., :3], alpha[..., None]], 2), share
-
-
-def reduce(
-    rgba: Tensor,
-    scale: int,
-    background: tuple[float, float, float] | None,
-    downsampling: str = "box",
-    mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor | None]:
-    """(3, H, W) uint8 on the background, or without one (4, H, W) premultiplied with alpha; and (H, W) of the mask.
-
-    Averaged are the stored values, over squares of pixels or with `downsampling` "bicubic" with a cubic kernel
-    (a = -0.5) of 4 scales' width, as Pillow does. Colours count by their alpha. With "blender" they do not: straight
-    colours and alpha are averaged apart and then composited, as the files of the multi-scale Blender set were made.
-    With a mask (H, W) the mean is that of what counts, by its share; where nothing counts the result is black.
-    """
-    if scale == 1 and mask is None and bool((rgba[:, :, 3] == 255).all()):
-        # Most photographs: what follows would give the same.
-        return rgba[:, :, : 4 if background is None else 3].permute(2, 0, 1).contiguous(), None
-    full = rgba.permute(2, 0, 1).float() / 255
-    if downsampling != "blender":
-        full[:3] *= full[3:]
-    share = None
-    if mask is not None:
-        share = mask.float()[None] / 255
-        full = full * share
-    full = _reduced(full, scale, downsampling)
-    if share is not None:
-        share = _reduced(share, scale, downsampling)
-        counts = share > LEAST_SHARE
-        full, share = torch.where(counts, full / share, 0), torch.where(counts, share.clamp_max(1), 0)
-    if downsampling == "bicubic" and scale > 1:  # the kernel overshoots, and not in all channels alike
-        full = full.clamp(0, 1)
-        full[:3] = torch.minimum(full[:3], full[3:])
-    color, alpha = full.split([3, 1])
-    if downsampling == "blender":
-        color = color * alpha
-    if background is None:
-        color = torch.cat([color, alpha])
-    else:
-        color = color + color.new_tensor(background)[:, None, None] * (1 - alpha)
-    if share is None:
-        return _levels(color), None
-    return _levels(torch.where(share > 0, color, 0)), _levels(share)[0]
-
-
-def _reduced(planes: Tensor, scale: int, downsampling: str) -> Tensor:
-    if downsampling == "bicubic" and scale > 1:
-        size = planes.shape[1] // scale, planes.shape[2] // scale
-        return functional.interpolate(planes[None], size, mode="bicubic", antialias=True)[0]
-    return functional.avg_pool2d(planes, scale) if scale > 1 else planes
-
-
-def _levels(planes: Tensor) -> Tensor:
-    return (255 * planes).round().to(torch.uint8)

@@ -13,6 +13,7 @@ import torch
 from .. import io
 from ..footprints import FASTEST, INTEGRATING, RECOMMENDED, resolve_footprint
 from .captures import IMAGES, about_folds, lens_models
+from .depth import PROBLEMS
 from .evidence import (
     LARGEST,
     LEAST_SEEN,
@@ -45,6 +46,7 @@ ODD_EXPOSURE, ODD_BALANCE = 1.0, 0.5
 BLUR = 0.4  # octaves: sharp captures have up to 0.36 (bonsai), a blur of 1 px has 0.46 to 1
 ALIASED, SEVERAL_SCALES = 1.5, 4.0  # ranges of sampling intervals
 ALIASED_SHARE, SCALES_SHARE = 0.1, 0.05  # of the points: single ones are reconstructed at a wrong place
+FEW = 6  # photographs that show a point: fewer leave its depth open
 GRID = 17  # points along each side of a picture, where lenses are measured
 NAMED = 5  # photographs in a line
 
@@ -184,6 +186,7 @@ def plan_capture(
         _lens(found.items),
         *_colors(found),
         *_intervals(found.evidence, found.kept),
+        _depth(found),
         _blur(found.evidence, found.looked_at),
         _masks(found.capture, found.items, found.evidence),
         _alpha(found.evidence, found.looked_at),
@@ -282,6 +285,26 @@ def _intervals(evidence: Evidence, items: list[Photograph]) -> tuple[Finding, Fi
         reason = "of each picture are in the capture"
         return sampling, Finding("scales", len(stored), "sizes", YES, reason, {"scales": stored})
     return sampling, finding("scales", SEVERAL_SCALES, SCALES_SHARE, "", {"scales": SCALES}, "")
+
+
+def _depth(found: Survey) -> Finding:
+    """Whether measured depths are called for: where few photographs show most points."""
+    count, shown_by = sum(item.depth is not None for item in found.items), found.shown_by
+    parts = [f"in {len(found.items)} photographs"]
+    differences = sorted(measured.difference for measured in found.maps if measured.difference is not None)
+    if differences:
+        middle = differences[len(differences) // 2]
+        parts.append(f"after the best scale and shift they differ from the points by {middle:.1%}")
+    for problem in PROBLEMS:
+        bad = [measured.about for measured in found.maps if measured.problem == problem]
+        parts += [f"{len(bad)} {problem}, the first is {bad[0]}"] if bad else []
+    if shown_by is None:
+        return Finding("depth", count, "maps", NOT_KNOWN, "; ".join([*parts, _why_unknown(found.evidence)]))
+    parts.append(f"the median point is in {shown_by:.0f} photographs")
+    few = shown_by <= FEW
+    if few:
+        parts.append(f"train --depth {'maps' if differences else 'points'} takes what is known of depths")
+    return Finding("depth", count, "maps", YES if few else NO, "; ".join(parts))
 
 
 def _outlying(items: list[Photograph], outliers: dict[int, float]) -> Finding:

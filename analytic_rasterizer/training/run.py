@@ -20,6 +20,7 @@ from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
 from .automatic import Settled, measured_stops, said_first, settle
 from .captures import Photograph
+from .depth_targets import depths_of
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -128,8 +129,9 @@ class Run:
             stored = TrainingOptions.from_dict(state["options"])
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
-        if ranks.world > 1 and self.options.exposure != "none":
-            raise ValueError(f"exposure must be none for {ranks.world} processes, got {self.options.exposure}")
+        for name in ("exposure", "depth"):
+            if ranks.world > 1 and getattr(self.options, name) != "none":
+                raise ValueError(f"{name} must be none for {ranks.world} processes, got {getattr(self.options, name)}")
         if tensorboard:
             io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
         self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)
@@ -184,10 +186,12 @@ class Run:
             counts: Of a training that is resumed on several ranks, see `ShardedTrainer`.
         """
         background = background_of(self.options, self.capture.background)
-        pictures = self._load(self.capture.train, background, self.memory)
-        self.notes += look_at_pictures(self.scene, pictures, self.device)
+        depths = depths_of(self.options, self.capture, self.source["missing"] == "skip")
+        pictures = self._load(self.capture.train, background, self.memory, depths.maps)
+        self.notes += [*depths.notes, *look_at_pictures(self.scene, pictures, self.device)]
         if self.ranks.world == 1:
-            self.trainer = Trainer(self.options, start, pictures, background, self.device)
+            targets = depths.targets(pictures, self.device)
+            self.trainer = Trainer(self.options, start, pictures, background, self.device, depths=targets)
         else:
             self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, self.ranks, counts)
 
@@ -436,12 +440,10 @@ class Run:
         self.trainer.change_length(factor)
         self.notes.append(describe_change(before, self.options, self.progress.step, self.progress.share))
 
-    def _load(
-        self, photographs: list[Photograph], background: tuple[float, float, float] | None, memory: PictureMemory
-    ) -> Pictures:
+    def _load(self, photographs: list[Photograph], background, memory: PictureMemory, maps=None) -> Pictures:
         """Their pictures at the scales of the training."""
         options = self.options
-        return load_pictures(photographs, options.scales, background, self.device, options.downsampling, memory)
+        return load_pictures(photographs, options.scales, background, self.device, options.downsampling, memory, maps)
 
     def count(self) -> int:
         """Gaussians of all ranks."""

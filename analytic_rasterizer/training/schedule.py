@@ -124,6 +124,14 @@ def means_rate_at(step: int, share: float, options: TrainingOptions) -> float:
     return options.means_rate * (options.means_rate_end / options.means_rate) ** over
 
 
+def depth_weight_at(share: float, options: TrainingOptions) -> float:
+    """Weight of differences of depths in the loss."""
+    first, last = options.depth_weight, options.depth_weight_end
+    if options.depth == "none" or first == last == 0:
+        return 0.0
+    return first * (last / first) ** share if first and last else first + (last - first) * share
+
+
 def rates_factor_at(step: int, options: TrainingOptions, steps: float | None = None) -> float:
     """Factor of the learning rates other than that of the means; `steps` in all, None: as the options say."""
     over = max(step - steps_at(options.rates_from, steps or options.iterations), 0)

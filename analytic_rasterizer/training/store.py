@@ -170,10 +170,11 @@ class Made(NamedTuple):
 
     color: Tensor  # as in `Pictures.colors`
     mask: Tensor | None  # as in `Pictures.masks`
+    depth: Tensor | None = None  # as in `Pictures.depths`
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Made:
         """With other tensors."""
-        return Made(change(self.color), None if self.mask is None else change(self.mask))
+        return Made(*(None if tensor is None else change(tensor) for tensor in self))
 
 
 class Store:
@@ -287,7 +288,7 @@ class Store:
 
 
 class Column(Sequence):
-    """The colours, or the masks, of all views at a scale: each is fetched when it is asked for."""
+    """The colours, masks or depths of all views at a scale: each is fetched when it is asked for."""
 
     def __init__(self, store: Store, scale: int, views: int, field: int):
         self._store, self._scale, self._views, self._field = store, scale, views, field
@@ -302,5 +303,5 @@ class Column(Sequence):
 
 
 def columns(store: Store, scales: Collection[int], views: int) -> list[dict[int, Column]]:
-    """`Pictures.colors` and `Pictures.masks` of a store."""
-    return [{scale: Column(store, scale, views, field) for scale in scales} for field in range(2)]
+    """`Pictures.colors`, `Pictures.masks` and `Pictures.depths` of a store."""
+    return [{scale: Column(store, scale, views, field) for scale in scales} for field in range(len(Made._fields))]

@@ -12,6 +12,7 @@ import torch
 from .. import io
 from . import colmap
 from .captures import check_capture, read_cameras, without_files
+from .depth import Measured, measure_maps
 from .evidence import BrokenPictures, Evidence, gather, object_stops, spread_out, stops_of
 from .extent import outliers_of
 from .layouts import Capture, Photograph
@@ -32,6 +33,13 @@ class Survey(NamedTuple):
     tracked: bool  # tracks say what is visible
     evidence: Evidence  # of what was looked at
     stops: dict[Path, torch.Tensor]  # of what was looked at
+    maps: list[Measured]  # depth maps of what was looked at
+
+    @property
+    def shown_by(self) -> float | None:
+        """How many photographs of the capture show the median point; None: there is none in what was looked at."""
+        seen = self.evidence.seen[self.evidence.seen > 0]
+        return seen.double().median().item() * len(self.kept) / len(self.looked_at) if len(seen) else None
 
     @property
     def points(self) -> torch.Tensor | None:
@@ -80,4 +88,5 @@ def _look_at(capture: Capture, headers: dict[Path, Header], most: int, among: se
     else:
         stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in looked_at]))
     stops_by_file = dict(zip((item.files[1] for item in looked_at), stops))
-    return Survey(capture, items, outliers, kept, headers, looked_at, bool(tracks), evidence, stops_by_file)
+    maps = measure_maps(looked_at, points, tracks)
+    return Survey(capture, items, outliers, kept, headers, looked_at, bool(tracks), evidence, stops_by_file, maps)

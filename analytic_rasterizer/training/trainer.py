@@ -20,6 +20,7 @@ from ..render.arguments import camera_arguments
 from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
+from .depth_targets import Targets
 from .exposure import Exposures
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
@@ -27,7 +28,15 @@ from .optimizer import TrainingAdam
 from .options import TrainingOptions
 from .pictures import Pictures
 from .rendering import enlarged
-from .schedule import PictureOrder, Progress, footprint_at, means_rate_at, rates_factor_at, sh_degree_at
+from .schedule import (
+    PictureOrder,
+    Progress,
+    depth_weight_at,
+    footprint_at,
+    means_rate_at,
+    rates_factor_at,
+    sh_degree_at,
+)
 
 _picture_gradients = _C.Call("picture_gradients")
 
@@ -75,6 +84,7 @@ class Trainer:
         device: To train on, that of the pictures.
         ranks: See `ShardedTrainer`; this class trains in one process.
         extent: Of the capture, world units; None: that of the pictures and the starting Gaussians, see `extent_of`.
+        depths: What `options.depth` compares pictures with, by scale and view; None: nothing.
 
     Attributes:
         gaussians: The parameters at present.
@@ -93,9 +103,10 @@ class Trainer:
         device: str | torch.device,
         ranks: Ranks = ALONE,
         extent: float | None = None,
+        depths: Targets | None = None,
     ):
         self.options, self.pictures, self.device, self.ranks = options, pictures, torch.device(device), ranks
-        self.random_background = background is None
+        self.random_background, self.depths = background is None, depths
         self.extent = extent_of(pictures.views, start.means.cpu()) if extent is None else extent
         gaussians = start.map(lambda field: field.detach().to(self.device, torch.float32, copy=True).contiguous())
         gaussians = gaussians.map(Tensor.requires_grad_)
@@ -287,7 +298,8 @@ class Trainer:
             "opacity_weight": opacity_weight,
             "scale_weight": scale_weight,
         }
-        made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given, **compared, **self._camera(shown))
+        given |= compared | self._depth(shown) | self._camera(shown)
+        made = _picture_gradients(*self.gaussians, bg=shown.settings.bg, **given)
         loss, image, radii, gradients = made
         self._last = image, compared["target"], compared["mask"]
         return loss, radii, gradients
@@ -301,6 +313,12 @@ class Trainer:
             "ssim_weight": self.options.ssim_weight,
             "supersampling": self.options.supersampling,
         }
+
+    def _depth(self, shown: Shown) -> dict[str, Any]:
+        """What the depths of a picture are compared with, by the names of the op; nothing where they are not."""
+        weight = depth_weight_at(self.progress.share, self.options)
+        target = self.depths(shown.scale, shown.view) if self.depths is not None and weight else None
+        return {} if target is None else target.arguments(weight)
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
         """Camera and footprint of a picture by the names of the ops; made once for every picture and degree."""

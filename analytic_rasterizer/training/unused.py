@@ -48,6 +48,10 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
             note(["downsampling"], "the pictures are trained on at their full size")
     if options.begins_with is None:
         note(["footprint_from"], f"the footprint is {options.footprint} from the start")
+    if options.depth == "none":
+        note(["depth_weight", "depth_weight_end"], "depth is none")
+    if options.depth != "maps":
+        note(["depth_fit", "depth_unit"], f"it is for depth maps, and depth is {options.depth}")
     if options.sh_degree == 0:
         note(["sh_every"], "sh_degree is 0")
     if options.rates_half_life == 0:

@@ -22,6 +22,7 @@ OTHERS = {
     "analytic_rasterizer/io/metadata.py": {"mip"},  # what Brush writes into files
     "analytic_rasterizer/training/parts.py": {"box"},  # downsampling
     "analytic_rasterizer/training/pictures.py": {"box"},
+    "analytic_rasterizer/training/reduction.py": {"box"},
 }
 
 

@@ -175,7 +175,8 @@ def test_work_of_another_stream_is_waited_for(monkeypatch):
             told.append(f"waits for the {event}")
 
     step = Stream()
-    made = Made(torch.arange(12, dtype=torch.uint8).reshape(3, 2, 2), torch.ones(2, 2, dtype=torch.uint8))
+    color, mask = torch.arange(12, dtype=torch.uint8).reshape(3, 2, 2), torch.ones(2, 2, dtype=torch.uint8)
+    made = Made(color, mask, torch.ones(2, 2, 2, dtype=torch.float16))
     plan = Plan({(1, 0): HOST}, {DEVICE: 0, HOST: 16, FILE: 0}, ahead=2, threads=1)
     kept = Store(CPU, plan, {(1, 0): made}, None, None)
     kept._stream, empty = Stream(), torch.empty
@@ -185,8 +186,8 @@ def test_work_of_another_stream_is_waited_for(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "record_stream", lambda tensor, stream: told.append((tensor.shape, stream)))
     got = kept.get((1, 0))
     assert all(torch.equal(a, b) and a.data_ptr() != b.data_ptr() for a, b in zip(got, made))
-    assert told == ["recorded", "waits for the event", (made.color.shape, step), (made.mask.shape, step)]
-    assert kept.get((1, 0)) is got and len(told) == 4  # for its mask
+    assert told == ["recorded", "waits for the event", *((tensor.shape, step) for tensor in made)]
+    assert kept.get((1, 0)) is got and len(told) == 5  # for its mask
     kept.close()
 
 
