@@ -247,5 +247,7 @@ def test_inspect_calls_for_depths_where_few_photographs_show_most_points(tmp_pat
     found = depth_row(write_wall(tmp_path / "few", views=cameras()[3:8]))
     assert (found.number, found.verdict) == (0, YES)
     assert found.reason.endswith("in 5 photographs; train --depth points takes what is known of depths")
+    untracked = depth_row(write_wall(tmp_path / "untracked", views=cameras()[3:8], tracked=False))
+    assert untracked.verdict == YES and untracked.reason.endswith("in 5 photographs")
     none = depth_row(write_wall(tmp_path / "none", points=False))
     assert (none.number, none.verdict) == (0, plan.NOT_KNOWN) and "the capture has no points" in none.reason

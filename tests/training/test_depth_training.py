@@ -200,7 +200,7 @@ def test_maps_that_are_missing_or_broken(tmp_path):
 
 
 def test_a_lens_that_is_undistorted_has_no_maps(tmp_path):
-    views = cameras(lens=ar.Lens.perspective([-0.02]))
+    views = cameras(lens=ar.Lens.perspective([-0.02]))[:4]
     folder = write_wall(tmp_path / "wall", views, model=4, coefficients=(-0.02, 0.0, 0.0, 0.0))
     for view in views:
         save_16(folder / "depths" / f"{view.name}.png", 2**16 / depth_of(view))
