@@ -24,7 +24,8 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-architectures test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel docs format lint clean
+.PHONY: demo ready test test-architectures build-cpp build-sanitized build-kernels-on-host build-simple-knn build-tests test-cpp test-python test-simple-knn test-browser test-sanitized test-sanitized-quick \
+  test-python-sanitized fuzz fuzz-core bench wheel docs format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
@@ -42,9 +43,16 @@ else
 	$(MAKE) test-python
 endif
 
-test-cpp: $(VENV)/.tools
-	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
-	$(CMAKE) --build $(BUILD)/cpp -j $(JOBS)
+# Compilers at a time: those of a make -j around it, if there is one.
+PARALLEL = $(if $(findstring jobserver,$(MAKEFLAGS)),,-j $(JOBS))
+CMAKE_CPP = $(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
+SANITIZE ?= ON
+CMAKE_SANITIZED = $(CMAKE) -S . -B $(BUILD)/sanitized -DAR_SANITIZE=$(SANITIZE) -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
+build-cpp: $(VENV)/.tools
+	$(CMAKE_CPP)
+	+$(CMAKE) --build $(BUILD)/cpp $(PARALLEL)
+
+test-cpp: build-cpp
 	cd $(BUILD)/cpp && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
 
 # Every kernel for every architecture that a build without a GPU makes code for, warnings being errors. Needs nvcc
@@ -62,10 +70,31 @@ $(ARCHITECTURE_OBJECTS): $(BUILD)/architectures/%.o: FORCE
 FORCE:
 
 # The C++ tests again, under AddressSanitizer and UndefinedBehaviorSanitizer.
-test-sanitized: $(VENV)/.tools
-	$(CMAKE) -S . -B $(BUILD)/sanitized -DAR_SANITIZE=ON
-	$(CMAKE) --build $(BUILD)/sanitized -j $(JOBS)
+build-sanitized: $(VENV)/.tools
+	$(CMAKE_SANITIZED)
+	+$(CMAKE) --build $(BUILD)/sanitized $(PARALLEL)
+
+test-sanitized: build-sanitized
 	cd $(BUILD)/sanitized && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
+
+# In half the time: see AR_SANITIZE in CMakeLists.txt.
+test-sanitized-quick: $(VENV)/.installed
+	$(MAKE) test-sanitized SANITIZE=quick CORE_OBJECTS="$(EXTENSION_OBJECTS)"
+
+# What is tested, downloaded and compiled side by side: pip and links leave cores idle.
+ready: $(VENV)/.tools
+	$(MAKE) -j $(JOBS) $(VENV)/.installed build-kernels-on-host npm SANITIZE=quick
+	$(MAKE) build-tests
+
+build-kernels-on-host: $(VENV)/.tools
+	$(CMAKE_SANITIZED)
+	+$(CMAKE) --build $(BUILD)/sanitized $(PARALLEL) --target kernels_on_host
+	$(CMAKE_CPP)
+	+$(CMAKE) --build $(BUILD)/cpp $(PARALLEL) --target kernels_on_host
+
+build-tests: $(VENV)/.installed
+	$(MAKE) -j $(JOBS) build-simple-knn build-sanitized build-cpp SANITIZE=quick \
+	  CORE_OBJECTS="$(EXTENSION_OBJECTS)"
 
 test-python: $(VENV)/.installed npm
 	$(BIN)/python -m pytest -q $(TESTS)
@@ -79,9 +108,11 @@ npm:
 	  gltf-validator@2.0.0-dev.3.10 @sparkjsdev/spark@2.2.0 three@0.187.0 && touch $(NPM)/.installed; } || echo "nothing from npm: going on without"
 
 # Built in place and not installed, so that a simple_knn that VENV may have stays what it is.
-test-simple-knn: $(VENV)/.installed
+build-simple-knn: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11
 	cd simple_knn && $(abspath $(BIN))/python setup.py -q build_ext --inplace
+
+test-simple-knn: build-simple-knn
 	PYTHONPATH=simple_knn $(BIN)/python -m pytest -q -n 2 simple_knn/tests
 
 # The viewer in chromium and Firefox, which draw in software. Elsewhere than on Debian as root, CHROMIUM and FIREFOX name
@@ -116,8 +147,8 @@ test-python-sanitized: $(VENV)/.installed
 SEED ?= 100000
 SEEDS ?= 1000000
 fuzz-core: $(VENV)/.tools
-	$(CMAKE) -S . -B $(BUILD)/sanitized -DAR_SANITIZE=ON
-	$(CMAKE) --build $(BUILD)/sanitized -j $(JOBS) --target fuzz_core
+	$(CMAKE_SANITIZED)
+	+$(CMAKE) --build $(BUILD)/sanitized $(PARALLEL) --target fuzz_core
 	$(BUILD)/sanitized/fuzz_core $(SEED) $(SEEDS)
 
 bench: $(VENV)/.installed
