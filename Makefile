@@ -7,6 +7,7 @@
 
 PYTHON ?= python3
 VENV ?= .venv
+MAKEFLAGS += --no-print-directory
 # The torch to install where VENV has none. Any torch >= 2.4 will do: `make demo TORCH=torch==2.8.0`.
 TORCH ?= torch==2.13.0
 OUT ?= out
@@ -24,8 +25,9 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo ready test test-architectures build-cpp build-sanitized build-kernels-on-host build-simple-knn build-tests test-cpp test-python test-simple-knn test-browser test-sanitized test-sanitized-quick \
-  test-python-sanitized fuzz fuzz-core bench wheel docs format lint clean
+.PHONY: demo ready test build-tests build-cpp build-sanitized build-kernels-on-host build-simple-knn test-architectures \
+  test-cpp test-python test-simple-knn test-browser test-sanitized test-sanitized-quick test-python-sanitized fuzz \
+  fuzz-core bench wheel docs format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
