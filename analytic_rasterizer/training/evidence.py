@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from .. import io
 from .layouts import Photograph
-from .offsets import offsets_of
+from .offsets import Fit, offsets_of
 from .photographs import broken_files, read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
@@ -59,6 +59,7 @@ class Evidence(NamedTuple):
         transparent: (count,) bool, whether a picture has pixels that are not opaque.
         light: (count, 3) float64, mean light of the opaque pixels; NaN where there are none, or there are points.
         counted: (count,) float64, the share of a picture that its mask lets count.
+        position: (O, 2) float64, right and down from the principal point, in halves of the diagonal.
     """
 
     count: int
@@ -74,6 +75,7 @@ class Evidence(NamedTuple):
     transparent: Tensor
     light: Tensor
     counted: Tensor | None = None
+    position: Tensor | None = None
 
 
 class BrokenPictures(io.SceneError):
@@ -156,6 +158,7 @@ def gather(items: Sequence[Photograph], points: Tensor | None, tracks: dict[str,
         transparent=torch.tensor([look.transparent for look in looks]),
         light=torch.stack([look.light for look in looks]),
         counted=torch.tensor([look.counted for look in looks], dtype=torch.float64),
+        position=torch.cat([look.sampled[:, 7:] for look in looks]),
     )
 
 
@@ -166,7 +169,7 @@ class _Look(NamedTuple):
     visible: Tensor  # (V,) the points that it can see
     intervals: Tensor  # (V,) sizes of a pixel there
     observed: Tensor  # (O,) the points whose pixels are measured
-    sampled: Tensor  # (O, 7) of `_sampled`
+    sampled: Tensor  # (O, 9) of `_sampled`, and `Evidence.position`
     light: Tensor  # (3,) mean of the opaque pixels, without points
     counted: float  # share of the picture that its mask lets count
 
@@ -185,7 +188,7 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     planes = functional.avg_pool2d(planes, reduction) if reduction > 1 else planes
     if not len(points):
         light = _linear(planes[0, :3, planes[0, 3] == 1].double()).mean(1)
-        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 7), light, counted)
+        return _Look(transparent, none, points[:, 0], none, points.new_zeros(0, 9), light, counted)
     height, width = planes.shape[2:]
     view = item.view.resized(width, height)
     in_camera = points @ view.w2c[:3, :3].double().T + view.w2c[:3, 3].double()
@@ -198,7 +201,8 @@ def _look(item: Photograph, points: Tensor, chosen: Tensor, tracks: dict[str, Te
     if tracks:
         observed = tracks.get(view.name, none)
         observed = observed[(inside & chosen)[observed]]
-    sampled = _sampled(planes, pixels[observed])
+    position = (pixels[observed] - pixels.new_tensor(view.middle)) / math.hypot(width / 2, height / 2)
+    sampled = torch.cat([_sampled(planes, pixels[observed]), position], 1)
     opaque = sampled[:, 6] == 1
     intervals = depth[visible] / math.sqrt(view.fx * view.fy)
     unknown = points.new_full((3,), math.nan)
@@ -255,19 +259,34 @@ def _blurred(planes: Tensor) -> Tensor:
 def stops_of(evidence: Evidence) -> Tensor:
     """(count, 3): how much brighter each photograph is in red, green and blue than the others at the same points, in
     powers of two of linear light; NaN for photographs that share too few points with others."""
+    return consistent_fit(evidence, smooth_points(evidence))[0].offsets
+
+
+def smooth_points(evidence: Evidence) -> Tensor:
+    """The observations (O',) whose colours can be compared."""
     color = evidence.color
     good = ((color > DARKEST) & (color < BRIGHTEST)).all(1) & (evidence.roughness < SMOOTH)
-    logs, photograph, point = _linear(color[good]).log2(), evidence.photograph[good], evidence.point[good]
+    return good.nonzero()[:, 0]
+
+
+def consistent_fit(evidence: Evidence, rows: Tensor, terms: Tensor | None = None) -> tuple[Fit, Tensor]:
+    """The fit of light, in powers of two, of those observations `rows` whose points have one colour; and which they
+    are, (O',).
+
+    Args:
+        terms: (O, K) of all observations, as of `offsets_of`.
+    """
     for strictness in (0.5, 1, None):  # the first offsets are those with hidden and shining points
-        kept = _shared(photograph, point, evidence)
-        logs, photograph, point = logs[kept], photograph[kept], point[kept]
-        fit = offsets_of(logs, photograph, point, evidence.count)
+        rows = rows[_shared(evidence.photograph[rows], evidence.point[rows], evidence)]
+        point = evidence.point[rows]
+        given = None if terms is None else terms[rows]
+        logs = _linear(evidence.color[rows]).log2()
+        fit = offsets_of(logs, evidence.photograph[rows], point, evidence.count, given)
         if strictness is not None:
             deviations = strictness * fit.deviations.abs().amax(1)
             kept = medians_of(deviations, point, evidence.points)[point] < CONSISTENT
-            kept &= deviations < OUTLYING
-            logs, photograph, point = logs[kept], photograph[kept], point[kept]
-    return fit.offsets
+            rows = rows[kept & (deviations < OUTLYING)]
+    return fit, rows
 
 
 def object_stops(evidence: Evidence, axes: Tensor) -> Tensor:

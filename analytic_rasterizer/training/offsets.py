@@ -25,42 +25,66 @@ class Fit(NamedTuple):
 
     Attributes:
         offsets: (count, C) what the photographs add, with the median 0; NaN for those without observations.
+        slopes: (K, C) by which the terms are multiplied.
         deviations: (O, C) what is left of the values.
     """
 
     offsets: Tensor
+    slopes: Tensor
     deviations: Tensor
 
 
-def offsets_of(values: Tensor, photograph: Tensor, point: Tensor, count: int) -> Fit:
+def offsets_of(values: Tensor, photograph: Tensor, point: Tensor, count: int, terms: Tensor | None = None) -> Fit:
     """Offsets of `count` photographs from values (O, C) of points (O,) in photographs (O,), in float64.
 
     The sum of pseudo-Huber losses of the deviations is minimal. It is convex, so there is one solution: least squares
     with weights that follow from the deviations, until nothing moves. Levels of points are eliminated.
+
+    Args:
+        terms: (O, K) what else an observation may have, each times a slope; None: nothing.
     """
     _, point = point.unique(return_inverse=True)
+    terms = values[:, :0] if terms is None else terms
     weights = values.new_ones(len(values))
-    offsets, deviations = values.new_zeros(count, values.shape[1]), values
+    unknowns, deviations = values.new_zeros(count + terms.shape[1], values.shape[1]), values
     for _ in range(MOST_SOLUTIONS if len(values) else 0):
-        before = offsets
-        offsets, deviations = _weighted(values, photograph, point, weights, count)
-        if (offsets - before).abs().max() < CONVERGED:
+        before = unknowns
+        unknowns, deviations = _weighted(values, photograph, point, weights, count, terms)
+        if (unknowns - before).abs().max() < CONVERGED:
             break
         weights = (1 + deviations.square().mean(1) / SCALE**2).rsqrt()
+    offsets, slopes = unknowns.split([count, terms.shape[1]])
     seen = torch.bincount(photograph, minlength=count) > 0
     offsets = torch.where(seen[:, None], offsets, math.nan)
-    return Fit(offsets - offsets.nanmedian(0).values, deviations)
+    return Fit(offsets - offsets.nanmedian(0).values, slopes, deviations)
 
 
-def _weighted(values: Tensor, photograph: Tensor, point: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Offsets and deviations that are the least in the mean square, where observations have weights (O,)."""
-    points, weighted = int(point.max()) + 1, weights[:, None] * values
-    of_points = values.new_zeros(points).index_add_(0, point, weights)
-    shared = values.new_zeros(points * count).index_add_(0, point * count + photograph, weights).view(points, count)
-    means = values.new_zeros(points, values.shape[1]).index_add_(0, point, weighted) / of_points[:, None]
-    of_photographs = shared.sum(0)
-    matrix = torch.diag(of_photographs + DAMPING * of_photographs.mean()) - shared.T @ (shared / of_points[:, None])
-    right = values.new_zeros(count, values.shape[1]).index_add_(0, photograph, weighted) - shared.T @ means
-    offsets = torch.linalg.solve(matrix, right)
-    levels = means - shared @ offsets / of_points[:, None]
-    return offsets, values - offsets[photograph] - levels[point]
+def _weighted(
+    values: Tensor, photograph: Tensor, point: Tensor, weights: Tensor, count: int, terms: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Offsets with slopes, and deviations, that are the least in the mean square, where observations have weights (O,).
+
+    Their normal equations, less what the levels of the points have of them.
+    """
+    points, unknowns = int(point.max()) + 1, count + terms.shape[1]
+    weighted, weighted_terms = weights[:, None] * values, weights[:, None] * terms
+    of_photographs = values.new_zeros(count).index_add_(0, photograph, weights)
+    crossed = values.new_zeros(count, terms.shape[1]).index_add_(0, photograph, weighted_terms)
+    matrix = values.new_zeros(unknowns, unknowns)
+    matrix[:count, :count] = torch.diag(of_photographs)
+    matrix[:count, count:], matrix[count:, :count] = crossed, crossed.T
+    matrix[count:, count:] = weighted_terms.T @ terms
+    right = torch.cat([values.new_zeros(count, values.shape[1]), weighted_terms.T @ values])
+    right.index_add_(0, photograph, weighted)
+    # By point: weights of each unknown, and mean values.
+    shared = values.new_zeros(points, unknowns)
+    shared.view(-1).index_add_(0, point * unknowns + photograph, weights)
+    shared[:, count:].index_add_(0, point, weighted_terms)
+    of_points = values.new_zeros(points, 1).index_add_(0, point, weights[:, None])
+    means = values.new_zeros(points, values.shape[1]).index_add_(0, point, weighted) / of_points
+    matrix -= shared.T @ (shared / of_points)
+    right -= shared.T @ means
+    matrix.diagonal().add_(DAMPING * of_photographs.mean())
+    found = torch.linalg.solve(matrix, right)
+    levels = means - shared @ found / of_points
+    return found, values - found[:count][photograph] - terms @ found[count:] - levels[point]

@@ -24,14 +24,13 @@ from .evidence import (
     single_threaded,
     spread_out,
 )
+from .findings import NO, NOT_KNOWN, YES, Finding
 from .layouts import Capture, Photograph
 from .options import as_words, value_in_words
 from .photographs import TURNED, Header
 from .placement import offset_of
 from .survey import Survey, survey
-
-YES, NO, NOT_KNOWN = "yes", "no", "not known"
-"""Verdicts: whether a capture has an effect to an extent that matters."""
+from .vignetting import falloffs_of
 
 LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
 # Spreads up to which they are noise, and beyond which they are none, by whether tracks say what is visible. Projected
@@ -39,6 +38,7 @@ LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
 # stops where every second photograph is made 0.5 stops brighter.
 EXPOSURE = {True: (0.15, 0.15), False: (0.15, 0.3)}  # stops
 WHITE_BALANCE = {True: (5.0, 5.0), False: (5.0, 15.0)}  # percent
+VIGNETTING = 0.15  # stops: bonsai has 0.53, mouse 0.37; fox has 0.1, brighter to the left
 MIDDLE = 0.1  # of photographs that a spread leaves out: some see few points
 # Stops from the middle, from which on one photograph is odd: those of even and uneven captures have up to 0.65 (mouse),
 # and in the balance of colours 0.32 (fox).
@@ -48,7 +48,6 @@ ALIASED, SEVERAL_SCALES = 1.5, 4.0  # ranges of sampling intervals
 ALIASED_SHARE, SCALES_SHARE = 0.1, 0.05  # of the points: single ones are reconstructed at a wrong place
 FEW = 6  # photographs that show a point: fewer leave its depth open
 GRID = 17  # points along each side of a picture, where lenses are measured
-NAMED = 5  # photographs in a line
 
 SCALES = (1, 2, 4, 8)
 
@@ -56,47 +55,6 @@ SCALES = (1, 2, 4, 8)
 # photographs show most points at one size, and where edges are finer than a pixel (docs/internals/training.md).
 CHEAP_UNTIL, CHEAP_UNTIL_FINE = 0.9, 0.5
 MOST_VARIED = 50.0  # percent of points whose sampling intervals differ, up to which it does
-
-
-@dataclass(frozen=True)
-class Finding:
-    """An effect of a capture.
-
-    Attributes:
-        effect: Its name.
-        number: What was measured; None: nothing could be, or it is not finite.
-        unit: Of the number.
-        verdict: YES, NO or NOT_KNOWN: whether the effect matters here.
-        reason: What the number is, and what follows.
-        options: The option of `train` that acts on it, and its value: {"scales": (1, 2)}. Empty where there is none, or
-            none is needed.
-        photographs: Names of files that it is about.
-    """
-
-    effect: str
-    number: float | None
-    unit: str
-    verdict: str
-    reason: str
-    options: dict[str, Any] = field(default_factory=dict, hash=False)
-    photographs: tuple[str, ...] = ()
-
-    @property
-    def option(self) -> str:
-        """`options` as the command line spells them: "--scales 1,2"."""
-        return as_words(self.options)
-
-    def to_text(self) -> str:
-        """One line."""
-        shown = "" if self.number is None else f"{self.number:.3g} {self.unit} "
-        named = ", ".join(self.photographs[:NAMED]) + (", .." if len(self.photographs) > NAMED else "")
-        parts = [f"{shown}{self.reason}", named, self.option]
-        return f"{self.effect:<16} {self.verdict:<9}  {'; '.join(filter(None, parts))}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Everything, as JSON holds it; the option in words."""
-        names = ("effect", "number", "unit", "verdict", "option", "reason", "photographs")
-        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -185,6 +143,7 @@ def plan_capture(
     findings = (
         _lens(found.items),
         *_colors(found),
+        _vignetting(found),
         *_intervals(found.evidence, found.kept),
         _depth(found),
         _blur(found.evidence, found.looked_at),
@@ -365,6 +324,23 @@ def _colors(survey: Survey) -> tuple[Finding, Finding]:
         options = {"exposure": "affine"} if verdict == YES else {}
         found.append(Finding(effect, number, units[effect], verdict, reason, options, names))
     return tuple(found)
+
+
+def _vignetting(survey: Survey) -> Finding:
+    """The camera with the largest falloff; the verdict is that of all directions from the middle."""
+    effect, unit = "vignetting", "stops"
+    views = [item.view for item in survey.looked_at]
+    falloffs = [falloff for falloff in falloffs_of(survey.evidence, views) if not math.isnan(falloff.stops)]
+    if not falloffs:
+        reason = "too few smooth points are seen several times" if survey.evidence.points else None
+        return _unknown(effect, unit, reason or _why_unknown(survey.evidence))
+    worst = max(falloffs, key=lambda falloff: falloff.stops)
+    reason = f"darker than in the middle, at {worst.radius:.0%} of the way to the corners"
+    reason += f" ({len(worst.photographs)} photographs of one camera)"
+    verdict = NO if worst.stops <= VIGNETTING else YES if worst.least > worst.stops / 2 else NOT_KNOWN
+    if verdict == NOT_KNOWN:
+        reason += f"; not in all directions, in one {worst.least:.2g}"
+    return Finding(effect, worst.stops, unit, verdict, reason)
 
 
 def _in_unit(stops: float, effect: str) -> float:

@@ -29,9 +29,14 @@ def stored(light) -> np.ndarray:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def photograph(view, gain=(1.0, 1.0, 1.0), blur=0) -> np.ndarray:
-    """(H, W, 3) uint8 of the wall."""
-    planes = torch.from_numpy(stored(light_of(view) * np.array(gain))).permute(2, 0, 1)[:, None]
+def photograph(view, gain=(1.0, 1.0, 1.0), blur=0, falloff=None) -> np.ndarray:
+    """(H, W, 3) uint8 of the wall, whose light has a factor falloff(x, y) at halves of the diagonal from the middle."""
+    light = light_of(view) * np.array(gain)
+    if falloff is not None:
+        x, y = ((np.arange(size) + 0.5 - middle) for size, middle in zip((view.width, view.height), view.middle))
+        half = np.hypot(view.width, view.height) / 2
+        light = light * falloff(x / half, y[:, None] / half)[:, :, None]
+    planes = torch.from_numpy(stored(light)).permute(2, 0, 1)[:, None]
     for _ in range(blur):
         planes = evidence._blurred(planes)
     return (255 * planes[:, 0].permute(1, 2, 0)).round().to(torch.uint8).numpy()
@@ -85,13 +90,15 @@ def write_tracked(folder, views, points, colors, tracked=True, model=1, coeffici
         (folder / f"{name}.bin").write_bytes(b"".join(parts))
 
 
-def write_wall(folder, views=None, tracked=True, gains=None, blurred=(), shift=(0, 0, 0), points=True, **camera):
+def write_wall(
+    folder, views=None, tracked=True, gains=None, blurred=(), shift=(0, 0, 0), points=True, falloff=None, **camera
+):
     """A capture of the wall. Pictures are those of `views`, whose world is then shifted."""
     views = cameras() if views is None else views
     (folder / "images").mkdir(parents=True)
     for i, view in enumerate(views):
         gain = (1, 1, 1) if gains is None else gains(i)
-        picture = photograph(view, gain, 1 if i in blurred else 0)
+        picture = photograph(view, gain, 1 if i in blurred else 0, falloff)
         image.fromarray(picture).save(folder / "images" / f"{view.name}.png")
     xyz, colors = wall_points() if points else (torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3))
     world = [view.in_frame(tuple(-float(s) for s in shift)) for view in views]

@@ -39,7 +39,7 @@ def plan_of(folder, **options) -> dict:
 
 
 EVEN = {"lens", "exposure", "white balance", "scales", "blur", "masks", "alpha", "EXIF turns", "wrong sizes"}
-EVEN |= {"missing pictures", "outlying cameras", "far from zero", "sampling", "depth"}
+EVEN |= {"missing pictures", "outlying cameras", "far from zero", "sampling", "depth", "vignetting"}
 
 
 @pytest.mark.parametrize("tracked", [True, False])
@@ -127,7 +127,7 @@ def test_no_points(tmp_path):
     """What points tell is not known then, and what files tell is."""
     found = plan_of(write_wall(tmp_path / "wall", points=False))
     unknown = {name for name, finding in found.items() if finding.verdict == NOT_KNOWN}
-    assert unknown == {"exposure", "white balance", "sampling", "scales", "blur", "depth"}
+    assert unknown == {"exposure", "white balance", "vignetting", "sampling", "scales", "blur", "depth"}
     assert all(found[name].reason.endswith("the capture has no points") for name in unknown)
     assert all(found[name].number is None for name in unknown - {"depth"}) and found["depth"].number == 0
 
