@@ -71,7 +71,8 @@ def film(rows: list[list[torch.Tensor]], zoom: int) -> list:
 def save(frames: list, out: Path) -> None:
     palette = frames[0].quantize(COLORS)
     first, *rest = [picture.quantize(palette=palette, dither=0) for picture in frames]
-    first.save(out, save_all=True, append_images=rest, duration=MILLISECONDS, loop=0, optimize=True)
+    options = {"save_all": True, "append_images": rest, "duration": MILLISECONDS, "loop": 0, "optimize": True}
+    io.write_safely(out, lambda temporary: first.save(temporary, **options))
 
 
 def drawn(scene: ar.Gaussians, views: list[ar.View], footprint: str) -> list[torch.Tensor]:

@@ -11,6 +11,8 @@ import re
 import textwrap
 from pathlib import Path
 
+from analytic_rasterizer import io
+
 TUTORIALS = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
 BLOCK = re.compile(r"^( *)```(python|bash)\n(.*?)^\1```$\n?", re.M | re.S)
 LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)#\s]+)")
@@ -72,7 +74,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for page in sorted(TUTORIALS.glob("*.md")):
         path = folder / f"{page.stem}.ipynb"
-        path.write_text(json.dumps(notebook(page, folder), indent=1, ensure_ascii=False) + "\n")
+        io.write_text(path, json.dumps(notebook(page, folder), indent=1, ensure_ascii=False) + "\n")
         print(path)
 
 

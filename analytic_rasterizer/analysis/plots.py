@@ -49,9 +49,9 @@ def to_svg(plot: Draw) -> str:
     names = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
     colors = dict.fromkeys(names, INK) | {"svg.fonttype": "none", "svg.hashsalt": "report", "font.family": "sans-serif"}
     with optional_import("matplotlib", "analysis").rc_context(colors):
-        figure, text = _drawn([plot]), StringIO()
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
-    svg = text.getvalue()
+        figure, in_memory = _drawn([plot]), StringIO()
+        figure.savefig(in_memory, format="svg", transparent=True, metadata={"Date": None})
+    svg = in_memory.getvalue()
     return svg[svg.index("<svg") :].replace(INK, "currentColor")
 
 

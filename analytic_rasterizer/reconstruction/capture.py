@@ -204,7 +204,7 @@ def _picture(path: Path, folder: Path, number: int) -> str:
         return name
     name = f"{number:05}.png"
     with opened_picture(path, "train") as opened:
-        opened.convert("RGB").save(folder / name)
+        io.write_safely(folder / name, lambda temporary: opened.convert("RGB").save(temporary))
     return name
 
 

@@ -70,7 +70,8 @@ def take_photographs(path: Path, folder: Path, progress: Callable[[int, int], No
 
         def write() -> None:
             _, number, pixels = best
-            image.fromarray(pixels).save(folder / f"frame_{number:05}.jpg", quality=QUALITY, subsampling=0)
+            path, picture = folder / f"frame_{number:05}.jpg", image.fromarray(pixels)
+            io.write_safely(path, lambda temporary: picture.save(temporary, quality=QUALITY, subsampling=0))
 
         for number, data in enumerate(frames, 1):
             pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)

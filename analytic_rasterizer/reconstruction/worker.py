@@ -101,13 +101,13 @@ def _cameras_of_images(job: dict) -> dict[str, int]:
 
 def match(job: dict) -> None:
     """Compares the pairs; those in the database are there already."""
-    pairs, listed = job["pairs"], Path(job["database"]).with_name("pairs.txt")
+    pairs, temporary = job["pairs"], Path(job["database"]).with_name("pairs.txt")
     size = max(LEAST_PAIRS, -(-len(pairs) // CHUNKS))
     options = pycolmap.FeatureMatchingOptions(num_threads=job["threads"])
     for start in range(0, len(pairs), size):
         say(stage="pairs", done=start, of=len(pairs))
-        listed.write_text("".join(f"{first} {second}\n" for first, second in pairs[start : start + size]))
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+        temporary.write_text("".join(f"{first} {second}\n" for first, second in pairs[start : start + size]))
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(temporary))
         pycolmap.match_image_pairs(
             job["database"], matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
         )

@@ -182,8 +182,8 @@ def _pictures(folder: Path) -> list[str]:
         with image.open(path) as picture:
             small = picture.convert("RGB")
         small.thumbnail((WIDEST, WIDEST))
-        small.save(content := BytesIO(), "JPEG", quality=QUALITY)
-        data = base64.b64encode(content.getvalue()).decode()
+        small.save(in_memory := BytesIO(), "JPEG", quality=QUALITY)
+        data = base64.b64encode(in_memory.getvalue()).decode()
         name = escape(path.stem)
         picture = f'<img alt="{name}" src="data:image/jpeg;base64,{data}">'
         shown.append(f"<figure>{picture}<figcaption>{name}</figcaption></figure>")
