@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,9 +16,14 @@ from .. import io
 from ..io.errors import optional_import
 from ..io.images import opened_picture
 
+if TYPE_CHECKING:
+    from .layouts import Photograph
+
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
 TURNED = range(2, 9)  # its values for the others
 LOSSY = ("JPEG", "MPO", "WEBP", "AVIF")  # formats of Pillow, in which black is not always 0
+ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")  # of Pillow
+MASK_SIZE = 256  # px of the longer side of masks that random points are placed by
 STRIP = 64  # rows that are converted at a time
 
 
@@ -87,10 +92,35 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
     return functional.interpolate(counted[None, None].float(), (height, width), mode="area")[0, 0].round().byte()
 
 
+def counted_pixels(item: Photograph) -> Tensor | None:
+    """(H, W) bool, of at most MASK_SIZE px, where most of a square of pixels counts, and is opaque.
+
+    None where all do, or that is not known in the camera of the view.
+    """
+    if item.undistort:
+        return None
+    planes = []
+    try:
+        with opened_picture(item.files[1], "train") as opened:
+            size, has_alpha = opened.size, opened.mode in ALPHA_MODES or "transparency" in opened.info
+        if has_alpha:
+            planes.append(read_file(item.files[1]).rgba[:, :, 3])
+        if item.mask is not None:
+            planes.append(read_mask(item.mask, *size))
+    except io.SceneError:
+        return None  # who loads the picture says so
+    planes = [plane for plane in planes if (plane < 255).any()]
+    if not planes:
+        return None
+    reduction = -(-max(size) // MASK_SIZE)
+    counted = torch.stack(planes).amin(0)[None, None].float()
+    return functional.avg_pool2d(counted, reduction, ceil_mode=True)[0, 0] > 127
+
+
 def _counts(opened) -> np.ndarray:
     """(H, W) bool: where the Pillow image of a mask lets pixels count."""
     lossy, alpha = opened.format in LOSSY, None
-    if opened.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in opened.info:
+    if opened.mode in ALPHA_MODES or "transparency" in opened.info:
         opened = opened.convert("RGBA")
         alpha = np.array(opened.getchannel("A"))
     grey = opened.mode in ("1", "L", "F") or opened.mode.startswith("I")

@@ -6,6 +6,7 @@ Also the options of a checkpoint that goes on to another length.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import torch
@@ -14,10 +15,12 @@ from torch import Tensor
 from .. import io
 from ..gaussians import Gaussians
 from .captures import Capture
+from .evidence import READERS
 from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
 from .parts import BACKGROUNDS, RANDOM_BACKGROUND
+from .photographs import counted_pixels
 from .pictures import read_sizes
 from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
@@ -122,7 +125,7 @@ def first_gaussians(
         positions, colors = io.load_points(points)
         found = (positions.double() - offset).float(), colors
     views = [item.view for item in capture.train]
-    start = starting_gaussians(options, found, views if capture.starts_in_view else None)
+    start = starting_gaussians(options, found, views if capture.starts_in_view else None, _masks(found, capture))
     if found is None and not capture.starts_in_view and capture.offset is not None:
         # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
         focus, _ = focus_of(views)
@@ -135,8 +138,19 @@ def first_gaussians(
     return start, None if found is None else len(found[0])
 
 
+def _masks(points, capture: Capture) -> list[Tensor | None] | None:
+    """Where the photographs count that random points are placed by; None where no points are."""
+    if points is not None or not capture.starts_in_view:
+        return None
+    with ThreadPoolExecutor(READERS) as pool:
+        return list(pool.map(counted_pixels, capture.train))
+
+
 def starting_gaussians(
-    options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
+    options: TrainingOptions,
+    points: tuple[Tensor, Tensor] | None,
+    views: list[io.View] | None = None,
+    masks: list[Tensor | None] | None = None,
 ) -> Gaussians:
     """Gaussians at points, or at random positions where there are none. On the CPU.
 
@@ -145,6 +159,7 @@ def starting_gaussians(
             and stay in the order of the points.
         points: Positions and colours, (P, 3) each; None: random.
         views: In whose pictures random positions are; None: in the cube of NeRF-synthetic scenes.
+        masks: Where their pixels count, as of `points_in_view`.
 
     Raises:
         io.SceneError: Fewer than two points.
@@ -157,7 +172,7 @@ def starting_gaussians(
         if views is None:
             means, colors = random_points(options.random_points, options.seed)
         else:
-            means, colors = points_in_view(views, options.random_points, options.seed)
+            means, colors = points_in_view(views, options.random_points, options.seed, masks)
     else:
         means, colors = points
         if len(means) > limit:
