@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,9 +15,6 @@ from torch.nn import functional
 from .. import io
 from ..io.errors import optional_import
 from ..io.images import opened_picture
-
-if TYPE_CHECKING:
-    from .layouts import Photograph
 
 ORIENTATION, UPRIGHT = 0x0112, 1  # a tag of EXIF, and its value for pictures that are as they are stored
 TURNED = range(2, 9)  # its values for the others
@@ -92,21 +89,19 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
     return functional.interpolate(counted[None, None].float(), (height, width), mode="area")[0, 0].round().byte()
 
 
-def counted_pixels(item: Photograph) -> Tensor | None:
-    """(H, W) bool, of at most MASK_SIZE px, where most of a square of pixels counts, and is opaque.
+def counted_pixels(path: Path, mask: Path | None) -> Tensor | None:
+    """(H, W) bool, of at most MASK_SIZE px, where most of a square of pixels of a photograph counts, and is opaque.
 
-    None where all do, or that is not known in the camera of the view.
+    None where all do, or a file cannot be read.
     """
-    if item.undistort:
-        return None
     planes = []
     try:
-        with opened_picture(item.files[1], "train") as opened:
+        with opened_picture(path, "train") as opened:
             size, has_alpha = opened.size, opened.mode in ALPHA_MODES or "transparency" in opened.info
         if has_alpha:
-            planes.append(read_file(item.files[1]).rgba[:, :, 3])
-        if item.mask is not None:
-            planes.append(read_mask(item.mask, *size))
+            planes.append(read_file(path).rgba[:, :, 3])
+        if mask is not None:
+            planes.append(read_mask(mask, *size))
     except io.SceneError:
         return None  # who loads the picture says so
     planes = [plane for plane in planes if (plane < 255).any()]

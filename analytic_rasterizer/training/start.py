@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .. import io
 from ..gaussians import Gaussians
-from .captures import Capture
+from .captures import Capture, Photograph
 from .evidence import READERS
 from .extent import seen_distance
 from .health import FAINTEST
@@ -142,8 +142,12 @@ def _masks(points, capture: Capture) -> list[Tensor | None] | None:
     """Where the photographs count that random points are placed by; None where no points are."""
     if points is not None or not capture.starts_in_view:
         return None
+
+    def counted(item: Photograph) -> Tensor | None:  # in the camera of its view
+        return None if item.undistort else counted_pixels(item.files[1], item.mask)
+
     with ThreadPoolExecutor(READERS) as pool:
-        return list(pool.map(counted_pixels, capture.train))
+        return list(pool.map(counted, capture.train))
 
 
 def starting_gaussians(

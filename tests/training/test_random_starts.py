@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from capture_files import circle, tripod, write_pictures
+from capture_files import circle, tripod
 from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.training import placement
-from analytic_rasterizer.training.layouts import Photograph
 from analytic_rasterizer.training.photographs import MASK_SIZE, counted_pixels
 
 RING = circle(20)  # at 4 from zero, all around, and looking there
@@ -78,18 +77,11 @@ def test_every_number_of_points(count):
     assert not torch.equal(points, placement.points_in_view(RING, count, 4)[0])
 
 
-@pytest.fixture
-def photograph(tmp_path):
-    write_pictures(tmp_path, RING[:1], opaque=True)
-    return Photograph(RING[0], {1: tmp_path / "r_0.png"})
-
-
 def save(path, *planes):
     image.fromarray(np.stack(planes, -1) if len(planes) > 1 else planes[0]).save(path)
 
 
-def test_pixels_that_count(photograph, tmp_path):
-    assert counted_pixels(photograph) is None
+def test_pixels_that_count(tmp_path):
     half = np.zeros((600, 500), np.uint8)
     half[:, :250] = 255
     full = np.full_like(half, 255)
@@ -97,12 +89,12 @@ def test_pixels_that_count(photograph, tmp_path):
     save(tmp_path / "opaque.png", full, full, full, full)
     save(tmp_path / "mask.png", half.T.copy().T)
     files = {name: tmp_path / f"{name}.png" for name in ("alpha", "opaque", "mask")}
-    by_alpha = counted_pixels(photograph._replace(files={1: files["alpha"]}))
-    by_mask = counted_pixels(photograph._replace(files={1: files["opaque"]}, mask=files["mask"]))
+    by_alpha = counted_pixels(files["alpha"], None)
+    by_mask = counted_pixels(files["opaque"], files["mask"])
     assert max(by_alpha.shape) <= MASK_SIZE and torch.equal(by_alpha, by_mask)
     assert by_alpha[:, : by_alpha.shape[1] // 2].all() and not by_alpha[:, by_alpha.shape[1] // 2 + 1 :].any()
-    assert counted_pixels(photograph._replace(files={1: files["opaque"]})) is None
-    assert counted_pixels(photograph._replace(files={1: tmp_path / "gone.png"})) is None
+    assert counted_pixels(files["opaque"], None) is None
+    assert counted_pixels(tmp_path / "gone.png", None) is None
 
 
 def test_views_through_a_lens():
