@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from .. import io
 from .layouts import Photograph
-from .offsets import Fit, offsets_of
+from .offsets import Fit, medians_in_turn, medians_of, offsets_of
 from .photographs import broken_files, read_file, read_mask
 
 MOST_PHOTOGRAPHS, LARGEST = 100, 1024  # what is looked at: pictures, and px of their longer side
@@ -256,10 +256,15 @@ def _blurred(planes: Tensor) -> Tensor:
 # ------------------------------------------------------------------------------------ measures
 
 
-def stops_of(evidence: Evidence) -> Tensor:
+def stops_of(evidence: Evidence, tracked: bool = True) -> Tensor:
     """(count, 3): how much brighter each photograph is in red, green and blue than the others at the same points, in
-    powers of two of linear light; NaN for photographs that share too few points with others."""
-    return consistent_fit(evidence, smooth_points(evidence))[0].offsets
+    powers of two of linear light; NaN for photographs that share too few points with others.
+
+    Args:
+        tracked: Whether tracks say what is visible. Otherwise some points are hidden, and photographs that overlap
+            little would carry the error on from one to the next: medians in turn are taken, which hardly move then.
+    """
+    return consistent_fit(evidence, smooth_points(evidence), tracked=tracked)[0].offsets
 
 
 def smooth_points(evidence: Evidence) -> Tensor:
@@ -269,19 +274,26 @@ def smooth_points(evidence: Evidence) -> Tensor:
     return good.nonzero()[:, 0]
 
 
-def consistent_fit(evidence: Evidence, rows: Tensor, terms: Tensor | None = None) -> tuple[Fit, Tensor]:
+def consistent_fit(
+    evidence: Evidence, rows: Tensor, terms: Tensor | None = None, tracked: bool = True
+) -> tuple[Fit, Tensor]:
     """The fit of light, in powers of two, of those observations `rows` whose points have one colour; and which they
     are, (O',).
 
     Args:
-        terms: (O, K) of all observations, as of `offsets_of`.
+        terms: (O, K) of all observations, as of `offsets_of`; where tracks say what is visible.
+        tracked: As of `stops_of`.
     """
     for strictness in (0.5, 1, None):  # the first offsets are those with hidden and shining points
         rows = rows[_shared(evidence.photograph[rows], evidence.point[rows], evidence)]
         point = evidence.point[rows]
         given = None if terms is None else terms[rows]
         logs = _linear(evidence.color[rows]).log2()
-        fit = offsets_of(logs, evidence.photograph[rows], point, evidence.count, given)
+        photograph = evidence.photograph[rows]
+        if tracked:
+            fit = offsets_of(logs, photograph, point, evidence.count, given)
+        else:
+            fit = medians_in_turn(logs, photograph, point, evidence.count)
         if strictness is not None:
             deviations = strictness * fit.deviations.abs().amax(1)
             kept = medians_of(deviations, point, evidence.points)[point] < CONSISTENT
@@ -332,19 +344,6 @@ def _shared(photograph: Tensor, point: Tensor, evidence: Evidence) -> Tensor:
         common = torch.bincount(photograph[kept], minlength=evidence.count)
         kept = kept & (common[photograph] >= LEAST_COMMON)
     return kept
-
-
-def medians_of(values: Tensor, group: Tensor, count: int) -> Tensor:
-    """(count,): the median of the values (O,) of each group (O,); NaN for groups without any."""
-    order = values.argsort(stable=True)
-    order = order[group[order].argsort(stable=True)]
-    sizes = torch.bincount(group, minlength=count)
-    first = sizes.cumsum(0) - sizes
-    medians = values.new_full((count,), math.nan)
-    there = sizes > 0
-    low, high = ((first + half)[there] for half in ((sizes - 1) // 2, sizes // 2))
-    medians[there] = (values[order[low]] + values[order[high]]) / 2
-    return medians
 
 
 def _linear(stored: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 SCALE = 0.05  # deviation from which on a value counts less; of logarithms of colours, half of all deviate by more
 CONVERGED = 1e-3  # change of a number from one solution to the next
 MOST_SOLUTIONS = 50  # 20 are enough in all captures that were measured
+ROUNDS = 5  # of medians in turn; where photographs overlap, the first three do nearly all
 # Added to the diagonal, of its mean: photographs without common points are known up to a constant each.
 DAMPING = 1e-9
 
@@ -88,3 +89,33 @@ def _weighted(
     found = torch.linalg.solve(matrix, right)
     levels = means - shared @ found / of_points
     return found, values - found[:count][photograph] - terms @ found[count:] - levels[point]
+
+
+def medians_in_turn(values: Tensor, photograph: Tensor, point: Tensor, count: int) -> Fit:
+    """The same without terms, by a few rounds of medians over points and over photographs."""
+    _, point = point.unique(return_inverse=True)
+    offsets, levels = values.new_zeros(count, values.shape[1]), values[:0]
+    for _ in range(ROUNDS if len(values) else 0):
+        levels = _medians(values - offsets[photograph], point, int(point.max()) + 1)
+        offsets = _medians(values - levels[point], photograph, count)
+        offsets = offsets - offsets.nanmedian(0).values
+    if not len(values):
+        offsets = torch.full_like(offsets, math.nan)
+    return Fit(offsets, values[:0], values - offsets[photograph] - levels[point])
+
+
+def _medians(values: Tensor, group: Tensor, count: int) -> Tensor:
+    return torch.stack([medians_of(channel, group, count) for channel in values.unbind(1)], 1)
+
+
+def medians_of(values: Tensor, group: Tensor, count: int) -> Tensor:
+    """(count,): the median of the values (O,) of each group (O,); NaN for groups without any."""
+    order = values.argsort(stable=True)
+    order = order[group[order].argsort(stable=True)]
+    sizes = torch.bincount(group, minlength=count)
+    first = sizes.cumsum(0) - sizes
+    medians = values.new_full((count,), math.nan)
+    there = sizes > 0
+    low, high = ((first + half)[there] for half in ((sizes - 1) // 2, sizes // 2))
+    medians[there] = (values[order[low]] + values[order[high]]) / 2
+    return medians

@@ -337,9 +337,13 @@ def _vignetting(survey: Survey) -> Finding:
     worst = max(falloffs, key=lambda falloff: falloff.stops)
     reason = f"darker than in the middle, at {worst.radius:.0%} of the way to the corners"
     reason += f" ({len(worst.photographs)} photographs of one camera)"
-    verdict = NO if worst.stops <= VIGNETTING else YES if worst.least > worst.stops / 2 else NOT_KNOWN
-    if verdict == NOT_KNOWN:
-        reason += f"; not in all directions, in one {worst.least:.2g}"
+    if worst.stops <= VIGNETTING:
+        return Finding(effect, worst.stops, unit, NO, reason)
+    verdict = YES
+    if worst.least <= worst.stops / 2:
+        verdict, reason = NOT_KNOWN, f"{reason}; not in all directions, in one {worst.least:.2g}"
+    elif not survey.tracked:
+        verdict, reason = NOT_KNOWN, f"{reason}; without tracks this may be hidden points"
     return Finding(effect, worst.stops, unit, verdict, reason)
 
 

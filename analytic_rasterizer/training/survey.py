@@ -84,7 +84,7 @@ def _look_at(capture: Capture, headers: dict[Path, Header], most: int, among: se
     tracks = colmap.load_tracks(capture.source) if from_colmap else {}
     evidence = gather(looked_at, points, tracks)
     if evidence.points:
-        stops = stops_of(evidence)
+        stops = stops_of(evidence, bool(tracks))
     else:
         stops = object_stops(evidence, torch.stack([item.view.w2c[2, :3] for item in looked_at]))
     stops_by_file = dict(zip((item.files[1] for item in looked_at), stops))

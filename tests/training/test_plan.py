@@ -16,7 +16,7 @@ from wall import COUNT, SIZE, cameras, photograph, stored, wall_points, write_tr
 
 from analytic_rasterizer import Lens, cli, io
 from analytic_rasterizer.training import CaptureSource, automatic, colmap, evidence, plan
-from analytic_rasterizer.training.evidence import medians_of
+from analytic_rasterizer.training.offsets import medians_of
 from analytic_rasterizer.training.options import as_words
 from analytic_rasterizer.training.photographs import Stored
 from analytic_rasterizer.training.plan import (

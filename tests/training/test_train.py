@@ -82,7 +82,7 @@ def of_transforms(change):
 BROKEN = {
     "no folder": (lambda f: f.rename(f.with_name("elsewhere")), "no such folder"),
     "nothing in it": (
-        lambda f: (f / "transforms_train.json").unlink(),
+        lambda f: [shutil.rmtree(f / "train"), shutil.rmtree(f / "test"), (f / "transforms_train.json").unlink()],
         "expected transforms_train.json, metadata.json",
     ),
     "missing pictures": (
