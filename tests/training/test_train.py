@@ -793,7 +793,8 @@ def test_watching_shows_the_scene_and_changes_no_bit(synthetic, tmp_path, monkey
     assert re.search(r"^watch at http://127\.0\.0\.1:\d+/[\w-]+/$", capsys.readouterr().out, re.M)
     assert [step for _, step, *_ in shown] == list(range(13))
     assert [force for *_, force in shown] == [False] * 12 + [True]
-    assert shown[9][2] == "" and re.fullmatch(r"loss [\d.]+, PSNR [\d.]+, Gaussians 60", shown[10][2])
+    last = r"loss [\d.]+, PSNR [\d.]+, Gaussians 60, footprint moment:samples=4"
+    assert shown[9][2] == "" and re.fullmatch(last, shown[10][2])
     written = io.load_scene(tmp_path / "watched" / files.SCENE)
     torch.testing.assert_close(shown[-1][0].scales.cpu(), written.scales, rtol=1e-5, atol=1e-6)
     alone, together = ((tmp_path / name / files.SCENE).read_bytes() for name in ("alone", "watched"))
