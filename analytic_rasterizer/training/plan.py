@@ -67,7 +67,6 @@ class CapturePlan:
         looked_at: How many of them were read.
         findings: One for each effect.
         notes: What was chosen among what the folder holds, as `Capture.notes`.
-        stops: By the paths of the photographs that were read: (3,) of `stops_of_photographs`.
         survey: What the findings are from, for plots.
     """
 
@@ -76,8 +75,12 @@ class CapturePlan:
     looked_at: int
     findings: tuple[Finding, ...]
     notes: tuple[str, ...] = ()
-    stops: dict[Path, torch.Tensor] = field(default_factory=dict, repr=False, compare=False)
     survey: Survey | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def stops(self) -> dict[Path, torch.Tensor]:
+        """By the paths of the photographs that were read: (3,) of `stops_of_photographs`."""
+        return {} if self.survey is None else self.survey.stops
 
     @property
     def options(self) -> dict[str, Any]:
@@ -155,7 +158,7 @@ def plan_capture(
         _far([item.view for item in found.kept], found.points),
     )
     notes = found.capture.notes
-    return CapturePlan(str(folder), len(found.items), len(found.looked_at), findings, notes, found.stops, found)
+    return CapturePlan(str(folder), len(found.items), len(found.looked_at), findings, notes, found)
 
 
 @single_threaded()

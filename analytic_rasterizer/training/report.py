@@ -91,21 +91,23 @@ def write_report(folder, path, with_capture: bool = True) -> None:
     io.write_text(path, f"{page}<body><h1>{title}</h1>\n" + "\n".join(parts) + "\n</body></html>\n")
 
 
-def _read(path: Path) -> Any:
+def _text(path: Path) -> str:
     if not path.is_file():
         raise io.SceneError(f"{path.parent}: no training, {path.name} is missing", "give the folder that `train` wrote")
+    return path.read_text(encoding="utf-8")
+
+
+def _read(path: Path) -> Any:
+    text = _text(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(text)
     except ValueError as error:
         raise io.SceneError(f"{path}: not what `train` writes ({error})") from None
 
 
 def _history(folder: Path) -> list[dict]:
-    path = folder / LOG
-    if not path.is_file():
-        raise io.SceneError(f"{folder}: no training, {LOG} is missing", "give the folder that `train` wrote")
-    history = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    path, history = folder / LOG, []
+    for number, line in enumerate(_text(path).splitlines(), 1):
         try:
             entry = json.loads(line)
             history.append({name: entry[name] for name in ("step", "seconds", "loss", "psnr", "gaussians")})

@@ -6,7 +6,6 @@ import commands
 import numpy as np
 import pytest
 import torch
-from capture_files import circle, write_nerf_synthetic
 from commands import command, refused
 from train_extra import image
 
@@ -17,18 +16,11 @@ from analytic_rasterizer.training import files
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("synthetic")
-    write_nerf_synthetic(folder, circle(9), circle(3))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trained(capture, tmp_path_factory):
+def trained(synthetic, tmp_path_factory):
     """A few steps along rays."""
     out = tmp_path_factory.mktemp("trained")
     options = "--iterations 30 --random-points 60 --effects none --density none --no-evaluate --order ray"
-    assert commands.train(capture, out, options, "--footprint box:samples=1") == 0
+    assert commands.train(synthetic, out, options, "--footprint box:samples=1") == 0
     return out
 
 
@@ -38,14 +30,14 @@ def test_a_training_says_its_order(trained):
     assert "analytic_rasterizer order ray" in (trained / files.SCENE).read_bytes().split(b"end_header")[0].decode()
 
 
-def test_steps_are_those_of_the_order(capture, tmp_path):
+def test_steps_are_those_of_the_order(synthetic, tmp_path):
     """The gradients of the order, which the picture of a step has too: the two orders part from the first step on."""
     found = {}
     for order in (CENTER, RAY):
         options = training.TrainingOptions(
             iterations=3, random_points=60, effects="none", density="none", footprint="box:samples=1", order=order
         )
-        run = training.Run(capture, tmp_path / order, options)
+        run = training.Run(synthetic, tmp_path / order, options)
         run.train()
         found[order] = run.trainer.gaussians.means.detach().clone()
     assert not torch.equal(found[CENTER], found[RAY])
