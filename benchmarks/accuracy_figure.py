@@ -58,13 +58,14 @@ def draw_time(plt, out: Path) -> None:
     for axis, (psnr_column, time_column, title) in zip(axes, SCENES):
         shown = points(psnr_column, time_column)
         psnr_of = {name: psnr for name, _, psnr in shown}
-        below = {"analytic", "box, 1", min("box, 4", "moment, 1", key=psnr_of.get)}  # labels that others would cover
+        # Labels that others would cover: points down.
+        down = {"analytic": 5, "box, 1": 20, min("box, 4", "moment, 1", key=psnr_of.get): 15}
         for name, time, psnr in shown:
             several = name.startswith("moment") or name in ("box, 4", "box, 16")
             axis.plot(time, psnr, "o", color=SEVERAL if several else ONE, markersize=8)
             if name not in ("mip", "cumulant"):  # which lie on box, 1
                 text = {"box, 1": "box 1, mip, cumulant"}.get(name, name.replace(", ", " "))
-                axis.annotate(text, (time, psnr), (7, -15 if name in below else 5), textcoords="offset points")
+                axis.annotate(text, (time, psnr), (7, -down.get(name, -5)), textcoords="offset points")
         left, right = min(t for _, t, _ in shown), max(t for _, t, _ in shown)
         axis.set_xlim(left - 0.05 * (right - left), right + 0.25 * (right - left))
         axis.set_ylim(top=max(psnr_of.values()) + 6)

@@ -1,14 +1,16 @@
-"""Draws docs/images/footprints.png: what each footprint lets a pixel see of a splat, and of two splats in one pixel.
+"""Draws docs/images/footprints_one.png and footprints_two.png: what each footprint lets a pixel see of a splat, and of
+two splats in one pixel.
 
-    python benchmarks/footprint_figure.py [--out docs/images/footprints.png]
+    python benchmarks/footprint_figure.py [--out docs/images]
 
-All weights and shares in the picture are computed by the library. Needs `pip install ".[analysis]"`.
+All weights and shares in the pictures are computed by the library. Needs `pip install ".[analysis]"`.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,33 +20,39 @@ from analytic_rasterizer.footprints import UNFILTERED, stated
 from analytic_rasterizer.io import optional_import
 
 NEAR, FAR, LIGHT, INK = (0.16, 0.44, 0.75), (0.93, 0.49, 0.13), (0.93, 0.93, 0.92), (0.13, 0.13, 0.16)
+TEXT = "#6b7685"  # legible on white and on black
 REACH = 0.74  # px: half the side of a panel, which shows one pixel and what lies around it
 EXTENT = (-REACH, REACH, -REACH, REACH)
 FINE = 64  # samples along a pixel's side for the truth
 DISTANCE = 1000.0  # of the splats from a camera whose focal length is as large: a unit of length is a pixel
-WIDTH, HEIGHT, SIDE = 12, 7.9, 0.165  # of the figure, inches, and of a panel, as a share of its width
-COLORS = 256
+# Inches, of which a phone shows 0.57: labels have half of their points there.
+WIDTH, HEIGHT = 6.6, 6.2  # of a figure
+SIDE, GAP, MARGIN, TITLE = 2.0, 0.25, 0.05, 0.42  # of a panel; between panels; around them; for a name
+NAME, BAR = 18, 17  # points
+SHADES = 16  # of text, in the palette
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 OPACITY = 0.98
 TURN = math.radians(14)  # of the splats' long axes from the vertical
 SIGMAS = 0.24, 1.1  # px, along the short and the long axis
 MEANS = torch.tensor([[-0.1, 0.05], [0.36, -0.05]], dtype=torch.float64)  # of the near and the far splat, px
 
 
-# Name, what is done, footprint, and what stands for the pixel.
+# Name, footprint, and what stands for the pixel.
 ONE_SPLAT = [
-    ("truth", "mean over the pixel's square,\nwithout an approximation", "exact", "square"),
-    ("point (3DGS)", "value at the pixel's centre,\nof a splat made wider", "point", "dot"),
-    ("box, 1 sample; mip", "mean over a soft, round\npixel (a Gaussian)", "box:samples=1", "window"),
-    ("analytic", "mean over a turned square:\na sigmoid along each axis", "analytic", "turned"),
-    ("cumulant", "mean over the square,\nas a series", "cumulant", "square"),
+    ("truth", "exact", "square"),
+    ("point (3DGS)", "point", "dot"),
+    ("box 1, mip", "box:samples=1", "window"),
+    ("analytic", "analytic", "turned"),
+    ("cumulant", "cumulant", "square"),
 ]
 TWO_SPLATS = [
-    ("truth", "orange shows only where\nblue leaves it uncovered", UNFILTERED, "square"),
-    ("one weight each", "blue dims orange as if spread\nevenly over the whole pixel", "exact", "square"),
-    ("box, 4 samples", "four small soft pixels,\neach blended by itself", "box:samples=4", "window"),
-    ("box, 16 samples", "sixteen smaller ones,\neach blended by itself", "box:samples=16", "window"),
-    ("moment, 4 samples", "four soft quarters, which blue\npushes to where it is not", "moment:samples=4", "moved"),
+    ("truth", UNFILTERED, "square"),
+    ("one weight", "exact", "square"),
+    ("box 4", "box:samples=4", "window"),
+    ("box 16", "box:samples=16", "window"),
+    ("moment 4", "moment:samples=4", "moved"),
 ]
+KEY = "dashed: pixel\ngrey: what\nstands for it\nbar: how much\nof the pixel, %\nmarks: truth"
 
 
 def covariance(extra: float = 0.0) -> torch.Tensor:
@@ -154,64 +162,74 @@ def draw_pixel(axes, kind: str, footprint: str) -> None:
 
 def draw_bar(axes, parts: list[float], truth: list[float]) -> None:
     """How much of the pixel shows each splat and the background; ticks are where the truth ends."""
-    left = 0.0
-    for part, color in zip(parts, (NEAR, FAR)):
-        axes.barh(0, part, left=left, height=1, color=color)
-        axes.text(left + part / 2, 0, f"{100 * part:.0f}%", color="white", ha="center", va="center", fontsize=11,
+    ends, true = np.cumsum([0.0, *parts]), np.cumsum([0.0, *truth])
+    for i, (part, color) in enumerate(zip(parts, (NEAR, FAR))):
+        axes.barh(0, part, left=ends[i], height=1, color=color)
+        middle = (max(ends[i], true[i]) + min(ends[i + 1], true[i + 1])) / 2  # where no mark is
+        axes.text(middle, 0, f"{100 * part:.0f}", color="white", ha="center", va="center", fontsize=BAR,
                   fontweight="bold")  # fmt: skip
-        left += part
-    axes.barh(0, 1 - left, left=left, height=1, color=LIGHT)
-    for end in np.cumsum(truth):
-        axes.plot([end, end], [-0.75, 0.75], color=INK, linewidth=1.6)
+        axes.plot([true[i + 1]] * 2, [-0.5, 0.5], color=INK, linewidth=2.4)
+    axes.barh(0, 1 - ends[-1], left=ends[-1], height=1, color=LIGHT, zorder=0)
     axes.set(xlim=(-0.01, 1.01), ylim=(-0.8, 0.8))
     axes.axis("off")
 
 
-def draw(path) -> None:
-    """Writes the figure, with a palette, which makes the file small."""
-    figure = optional_import("matplotlib.figure", "analysis").Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
+def draw(path, panels: list[tuple], count: int) -> None:
+    """Writes the figure of the first `count` splats, three panels in a row and the key after the last."""
+    figure = optional_import("matplotlib.figure", "analysis").Figure(figsize=(WIDTH, HEIGHT), facecolor="none")
     FigureCanvas = optional_import("matplotlib.backends.backend_agg", "analysis").FigureCanvasAgg
     canvas = FigureCanvas(figure)
 
-    def write(x, y, text, size, **style):
-        figure.text(x, y, text, fontsize=size, va="top", **{"color": INK, **style})
+    def at(x, y, width, height):
+        """Axes with a corner at x, y and a size, inches from the upper left of the figure."""
+        return figure.add_axes((x / WIDTH, 1 - (y + height) / HEIGHT, width / WIDTH, height / HEIGHT))
 
-    write(0.012, 0.983, "A footprint decides what a pixel sees of a splat", 19, fontweight="bold")
-    write(0.012, 0.93, "Dashed: the pixel. Grey: what stands for it. Bar: how much of the pixel shows each splat; "
-          "the black marks are the truth.", 11.5)  # fmt: skip
-    for row, (title, panels, count) in enumerate([
-        ("One splat", ONE_SPLAT, 1),
-        ("Two splats in one pixel, the blue one nearer to the camera", TWO_SPLATS, 2),
-    ]):  # fmt: skip
-        top = 0.885 - 0.455 * row
-        write(0.012, top, title, 14.5, fontweight="bold", color="0.35")
-        truth = None
-        for column, (name, text, footprint, kind) in enumerate(panels):
-            left = 0.012 + 0.1985 * column
-            write(left, top - 0.041, name, 13, fontweight="bold")
-            write(left, top - 0.07, text, 10, color="0.3", linespacing=1.15)
-            if count == 1:
-                parts = [ar.footprint_weight(-MEANS[0], covariance(), footprint).item()]
-            else:
-                parts = shares(footprint, FINE if footprint == UNFILTERED else 1)[:2].tolist()
-            truth = truth or parts
-            axes = figure.add_axes((left, top - 0.12 - SIDE * WIDTH / HEIGHT, SIDE, SIDE * WIDTH / HEIGHT))
-            shown = "point" if footprint == "point" else UNFILTERED
-            axes.imshow(splat_picture(count, shown).numpy(), extent=EXTENT, origin="lower", interpolation="bilinear")
-            draw_pixel(axes, kind, footprint)
-            axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:][::-1], xticks=[], yticks=[])
-            for spine in axes.spines.values():
-                spine.set(color="0.75")
-            draw_bar(figure.add_axes((left, top - 0.163 - SIDE * WIDTH / HEIGHT, SIDE, 0.036)), parts, truth)
+    def write(x, y, text, size, **style):
+        figure.text(x / WIDTH, 1 - y / HEIGHT, text, fontsize=size, va="top", color=TEXT, **style)
+
+    truth = None
+    for number, (name, footprint, kind) in enumerate(panels):
+        x, y = MARGIN + (SIDE + GAP) * (number % 3), MARGIN + (HEIGHT / 2) * (number // 3)
+        write(x, y, name, NAME, fontweight="bold")
+        if count == 1:
+            parts = [ar.footprint_weight(-MEANS[0], covariance(), footprint).item()]
+        else:
+            parts = shares(footprint, FINE if footprint == UNFILTERED else 1)[:2].tolist()
+        truth = truth or parts
+        axes = at(x, y + TITLE, SIDE, SIDE)
+        shown = "point" if footprint == "point" else UNFILTERED
+        axes.imshow(splat_picture(count, shown).numpy(), extent=EXTENT, origin="lower", interpolation="bilinear")
+        draw_pixel(axes, kind, footprint)
+        axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:][::-1], xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set(color="0.75")
+        draw_bar(at(x, y + TITLE + SIDE + 0.05, SIDE, 0.4), parts, truth)
+    x, y = MARGIN + 2 * (SIDE + GAP), MARGIN + HEIGHT / 2
+    write(x, y + TITLE, KEY, NAME, linespacing=1.25)
     canvas.draw()
-    image = optional_import("PIL.Image").fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    image.quantize(COLORS, kmeans=2).save(path, optimize=True)
+    save(canvas.buffer_rgba(), path)
+
+
+def save(rgba, path) -> None:
+    """Writes a picture with a palette, which makes the file small. What is not opaque is text, in SHADES of alpha."""
+    Image = optional_import("PIL.Image")
+    pixels = np.asarray(rgba)
+    alpha, colors = pixels[..., 3], 256 - SHADES
+    palette = Image.fromarray(pixels[..., :3].copy()).quantize(colors, kmeans=2)
+    shade = colors + np.round(alpha / 255 * (SHADES - 1))
+    written = Image.fromarray(np.where(alpha == 255, np.asarray(palette), shade).astype(np.uint8), "P")
+    text = [int(TEXT[i : i + 2], 16) for i in (1, 3, 5)]
+    written.putpalette((palette.getpalette() + [0] * 3 * colors)[: 3 * colors] + text * SHADES)
+    alphas = [255] * colors + [round(255 * i / (SHADES - 1)) for i in range(SHADES)]
+    written.save(path, optimize=True, transparency=bytes(alphas))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", default="docs/images/footprints.png", metavar="FILE")
-    draw(parser.parse_args().out)
+    parser.add_argument("--out", type=Path, default=IMAGES, metavar="DIR")
+    out = parser.parse_args().out
+    draw(out / "footprints_one.png", ONE_SPLAT, 1)
+    draw(out / "footprints_two.png", TWO_SPLATS, 2)
 
 
 if __name__ == "__main__":

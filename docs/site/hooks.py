@@ -20,8 +20,12 @@ ITEM = re.compile(r"( {0,4})([-*+]|\d+\.) ")
 # Code, in which nothing is a link; or a link, whose text may have code in it.
 LINK = re.compile(r"`[^`]+`|(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)\s]+)\)")
 
-# By class: figures on white, which a dark page shows inverted; figures whose labels a phone can read.
-FIGURES = {"plot": ("footprints", "growth"), "small": ("moving", "conventions", "accuracy_time", "errors_weight")}
+# By class: figures on white, which a dark page shows inverted; figures whose labels a phone can read, side by side
+# where there is room.
+FIGURES = {
+    "plot": ("growth",),
+    "small": ("moving", "conventions", "accuracy_time", "errors_weight", "footprints_one", "footprints_two"),
+}
 NAMES = re.compile(r"(?<!\[)`([A-Za-z_][\w.]*)`")
 
 log = logging.getLogger("mkdocs.hooks.links")

@@ -86,7 +86,7 @@ def test_what_is_too_wide_is_found(site, browser):
 
 @pytest.mark.gate
 def test_plots_are_dark_on_a_dark_page(site, browser):
-    with open_page(browser, (site / "footprints.html").as_uri(), size=(800, 800), color_scheme="dark") as page:
+    with open_page(browser, (site / "performance.html").as_uri(), size=(800, 800), color_scheme="dark") as page:
         filters = page.evaluate("() => [...document.querySelectorAll('img.plot')].map(i => getComputedStyle(i).filter)")
     assert filters and all("invert" in each for each in filters)
 
