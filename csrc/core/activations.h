@@ -1,5 +1,5 @@
 // The activations of 3DGS for one Gaussian: exp of scales, unit quaternions, sigmoid of opacities. Also their penalty,
-// a regulariser of the loss, and the 3D filter. The adjoints compute the values again.
+// a regulariser of the loss, and the 3D filter.
 #pragma once
 
 #include <cmath>
@@ -12,7 +12,7 @@ namespace ar {
 /// The least divisor of a quaternion, as in torch.nn.functional.normalize.
 inline constexpr double kMinQuaternionLength = 1e-12;
 
-/// Of a penalty: weighted sums over all Gaussians, and over the axes of each.
+/// Of a penalty: weighted sums over all Gaussians and their axes.
 template <typename T> struct PenaltyWeights {
   T opacity, scale;
 };

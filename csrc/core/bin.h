@@ -1,6 +1,6 @@
 // Which pixels and tiles a splat can touch: Support, the ellipse of a splat with exact extents, and BoxReach, a cheaper
 // test for boxes of pixels (docs/internals/numerics.md, "Extents of the support"). Extents cull splats and find their
-// tiles, blending tests boxes. depth_bits() makes the keys of the sort by depth.
+// tiles, blending tests boxes.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -119,7 +119,6 @@ AR_HD Range tiles_of(Range pixels, TileGrid grid) {
                                      : Range{0, -1};
 }
 
-/// `rows`: pixel rows of the support.
 template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
   const int top = tile_row << grid.tile_bits, bottom = top + grid.side() - 1;
   const T y0 = T(max(top, rows.first)), y1 = T(min(bottom, rows.last));
@@ -132,7 +131,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// Bits that sort as unsigned integers as depths >= 0 do. -0 counts as 0.
+/// Keys of the sort: unsigned integers in the order of depths >= 0. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
@@ -171,7 +170,6 @@ template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGr
   return found;
 }
 
-/// visit(tile index).
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
   for_each_tile_row(s, grid, [&](int row, Range columns) AR_HD_LAMBDA {
     for (int column = columns.first; column <= columns.last; ++column) visit(int64_t(row) * grid.columns() + column);

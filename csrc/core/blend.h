@@ -1,6 +1,4 @@
-// Compositing one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its adjoint"). For
-// samples that move, map_placed_sample makes the AdjointMap of a segment. mean_sums_of makes a pixel's part of
-// MeanSums.
+// Compositing one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its adjoint").
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.
@@ -81,8 +79,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// Repeats blend_placed_sample in the backward pass. `before`: not later than the last splat composited, so
-/// kTransmittanceMin need not be tested.
+/// Repeats blend_placed_sample in the backward pass. `before`: up to the last splat composited, so kTransmittanceMin
+/// need not be tested.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
@@ -102,8 +100,8 @@ template <class V> struct BlendGrad {
 /// Adjoint of blend_sample, called from the last splat to the first.
 ///
 /// `g_color`: the pixel's gradient times the splat's colour. `behind` (B of docs/internals/numerics.md) is that product
-/// for all later splats and the background, seen through this splat alone. `transmittance` and `behind` are read as
-/// after the splat, written as before it.
+/// for all later splats and the background, seen through this splat alone. It and `transmittance` are read as after the
+/// splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -159,7 +157,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // The `s` of docs/internals/numerics.md is of_difference.
+  // of_difference: the `s` of docs/internals/numerics.md.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),

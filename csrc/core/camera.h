@@ -1,6 +1,6 @@
-// A camera of any model: a mean's pixel, the Jacobian there, the blur, and the adjoints. The models are in
-// core/camera/. Most functions are compiled for two types: Camera, the pinhole of 3DGS, and FullCamera, all models and
-// effects as branches, which all threads take alike.
+// A camera of any model: a mean's pixel, the Jacobian there, the blur, and the adjoints. Most functions are compiled
+// for two types: Camera, the pinhole of 3DGS, and FullCamera, all models and effects as branches, which all threads
+// take alike.
 #pragma once
 
 #include "core/defocus.h"
@@ -61,7 +61,7 @@ AR_HD Vec3<T> jacobian_vjp(const Cam& camera, const Jacobian<T>& j, Vec3<T> view
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.jacobian_vjp(camera, j, view, grad); });
 }
 
-/// An upper bound of |W|^2, W the upper left 3x3 of the view (docs/internals/numerics.md, "Culling bound").
+/// An upper bound of |W|^2 (docs/internals/numerics.md, "Culling bound").
 template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   const Vec3<T> x = xyz(camera.view_x), y = xyz(camera.view_y), z = xyz(camera.view_z);
   const T xy = abs(dot(x, y)), xz = abs(dot(x, z)), yz = abs(dot(y, z));
@@ -114,7 +114,6 @@ AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const Proje
   });
 }
 
-/// The blur of a Gaussian at `view`.
 template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T> view) {
   const Lens<T>& lens = camera.lens;
   return {lens.moves() ? motion_streak(camera, view) : Vec2<T>{T(0), T(0)},

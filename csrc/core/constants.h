@@ -1,5 +1,5 @@
-// Constants of 3DGS, sizes of tiles, and limits that keep float32 finite. The viewer's page has copies, which a test
-// compares.
+// Constants of 3DGS, sizes of tiles, and limits that keep float32 finite. A test compares the copies in the viewer's
+// page.
 #pragma once
 
 namespace ar {
@@ -22,7 +22,7 @@ inline constexpr double kFrustumClamp = 1.3;
 /// A smaller alpha counts as zero.
 inline constexpr double kAlphaMin = 1.0 / 255.0;
 
-/// log2(kAlphaMin) - 1e-4: a margin hundreds of times the errors of rounding and exp2.
+/// log2(kAlphaMin) - 1e-4, hundreds of times the errors of rounding and exp2.
 inline constexpr double kLogAlphaMin = -7.99445;
 
 inline constexpr double kAlphaMax = 0.99;
@@ -59,12 +59,12 @@ inline constexpr double kSingular = 1e-6;
 /// An entry of the whitening matrix [1/px]. Only `point` without dilation exceeds it.
 inline constexpr double kMaxWhitening = 1e7;
 
-/// Limit of the gradient of a quaternion q, which grows as 1/|q|, and of 1/|q|.
+/// Limit of 1/|q| of a quaternion q, and of its gradient, which grows alike.
 inline constexpr double kMaxQuaternionGrad = 1e38;
 
 inline constexpr int kMaxChannels = 512;
 
-/// Weights are summed as integers in units of 2^-32, so that the order of pixels changes no bit.
+/// Weights are summed as integers of this unit: the order of pixels changes no bit.
 inline constexpr double kWeightUnit = 1.0 / 4294967296.0;
 
 inline constexpr double kPi = 3.14159265358979323846;

@@ -67,7 +67,7 @@ AR_HD Factors<T> project_covariance(const Cam& camera, const Gaussians<T>& g, in
     const Sym3<T>& c = g.cov3ds[i];
     const Vec3<T> cx = c * ax, cy = c * ay, n = cross(ax, ay);
     f.cov = {dot(ax, cx), dot(ax, cy), dot(ay, cy), dot(n, adjugate_times(c, n))};
-    // A needle whose entries were rounded.
+    // A rounded needle.
     if (f.cov.det < T(0) && f.cov.det >= T(-kSingular) * f.cov.xx * f.cov.yy) f.cov.det = T(0);
   } else {
     f.quaternion = normalize_quaternion(g.rotations[i]);

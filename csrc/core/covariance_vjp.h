@@ -1,5 +1,5 @@
-// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. Every
-// product is formed in coordinates in which its terms do not cancel (docs/internals/numerics.md, from "Gradient in the
+// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian.
+// Products are formed in coordinates in which terms do not cancel (docs/internals/numerics.md, from "Gradient in the
 // turned frame" on).
 #pragma once
 

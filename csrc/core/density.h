@@ -32,7 +32,7 @@ template <typename T> struct NoiseParams {
   T strength;              ///< of a transparent Gaussian
 };
 
-/// Adds one picture: the length of the gradient by means2D, and a view where the radius is above 0.
+/// Adds the length of the gradient by means2D, and a view where the radius is above 0.
 template <typename T> AR_HD void observe(const ObserveParams<T>& p, int64_t i) {
   const T x = p.gradients[i * p.stride + p.first], y = p.gradients[i * p.stride + p.first + 1];
   p.gradient_sums[i] += std::sqrt(x * x + y * y);

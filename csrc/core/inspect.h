@@ -1,4 +1,4 @@
-// Statistics of a pixel: how much it shows of every splat, the splat it shows most of, and its median splat.
+// Of a pixel: how much it shows of every splat, which it shows most, and its median splat.
 #pragma once
 
 #include "core/blend.h"
@@ -60,7 +60,6 @@ template <typename T, class P, Look kLook = Look::kStatistics> struct PixelSumma
   }
 
  private:
-  /// Mean over the samples of the light that is left.
   AR_HD T mean_through() const {
     T through = T(0);
     AR_UNROLL for (int s = 0; s < S; ++s) through += abs(transmittance[s]);

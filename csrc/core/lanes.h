@@ -1,5 +1,5 @@
-// The functions that formulas may call on a value type V: here float (a CUDA thread) and double (tests), in cpu/pack.h
-// several pixels of the CPU. ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
+// The functions that formulas may call on a type V: here float (a CUDA thread) and double (tests), in cpu/pack.h pixels
+// of the CPU. ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
 #pragma once
 
 #include <cfloat>
@@ -59,7 +59,7 @@ AR_HD float max(float a, float b) {
 #endif
 }
 
-/// a * b + c, contracted where there is an instruction; the build turns it off elsewhere, so that both passes round
+/// a * b + c, contracted where there is an instruction; the build contracts nothing else, so that both passes round
 /// alike.
 AR_HD float madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)
@@ -88,7 +88,7 @@ AR_HD float saturated_madd(float a, float b, float c) {
 }
 AR_HD double saturated_madd(double a, double b, double c) { return min(max(madd(a, b, c), 0.0), 1.0); }
 
-/// On a device one comparison: the bits of numbers outside [0, 1], and of -0, are larger integers.
+/// On a device one comparison: numbers outside [0, 1], and -0, have larger bits.
 AR_HD bool in_unit_interval(float x) {
 #if defined(__CUDA_ARCH__)
   return __float_as_uint(x) <= __float_as_uint(1.0f);
@@ -118,8 +118,7 @@ AR_HD double exp2(double x) { return std::exp2(x); }
 /// Within 4 ulp for normal results.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-// On a device sqrt and quotient lack the compiler's branch for extreme numbers, which instructions cannot be moved
-// around.
+// On a device sqrt and quotient lack the compiler's branch for extreme numbers, around which no instruction moves.
 
 /// Rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {

@@ -1,6 +1,5 @@
 // Projects one Gaussian to one splat, for every backend: project_gaussian makes mean, covariance, opacity and depth,
-// shape_splat shape and support, splat_color the colour. project_vjp is the adjoint of all three. may_be_visible culls
-// cheaply first. write_packed writes the row for another rank.
+// shape_splat shape and support, splat_color the colour. project_vjp is the adjoint of all three.
 #pragma once
 
 #include <type_traits>
@@ -68,14 +67,14 @@ template <typename T> struct ProjectedGaussian {
   Vec2<T> slope = {T(0), T(0)};  ///< of RayDepth (core/order.h), if the order is along rays
 };
 
-/// False if the matrix is no covariance, or derived numbers would overflow a float.
+/// False if this is no covariance, or derived numbers would overflow a float.
 template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
   const Cov2d<T>& cov = p.cov;
   return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// Any numbers. False if such a Gaussian would be culled, or the depth is negative or NaN.
+/// False if such a Gaussian would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   const Vec2<T> m = rows.means2d[i];
@@ -110,8 +109,8 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
-/// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 for a culled
-/// splat (outside the image, or its shape overflows).
+/// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 if culled
+/// (outside the image, or its shape overflows).
 template <typename T>
 AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
                       Support<T>* support = nullptr) {

@@ -42,8 +42,8 @@ template <typename T> struct RowMeasure {
   T opacity;
 };
 
-/// A row that is not drawn would show nothing: the nearest pixel centre is half a pixel beyond the ellipse, where alpha
-/// is below kAlphaMin also if the weight is an integral over the pixel.
+/// A row that is not drawn would show nothing: the nearest pixel centre is half a pixel beyond the ellipse, where an
+/// integral over the pixel too is below kAlphaMin.
 template <typename T>
 AR_HD RowMeasure<T> measure_row(const ProjectedGaussian<T>& p, const RowRules<T>& rules, TileGrid grid) {
   const T v = rules.variance, xx = p.cov.xx + v, yy = p.cov.yy + v;

@@ -1,5 +1,5 @@
-// Colour by direction from real spherical harmonics of degree 0 to 4, and the adjoint. kMax is the largest degree
-// compiled: the fourth costs registers and memory.
+// Colour by direction from real spherical harmonics of degree 0 to 4, and the adjoint. kMax: the largest compiled,
+// since the fourth costs registers and memory.
 #pragma once
 
 #include "core/vec.h"

@@ -10,10 +10,10 @@ namespace ar {
 
 inline constexpr int kSsimRadius = 5, kSsimWindow = 2 * kSsimRadius + 1;
 
-/// They keep quotients from 0 / 0.
+/// Against 0 / 0.
 inline constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
-/// Along one axis; at(k) is the value k pixels from the centre. The window is symmetric, so this is also the adjoint.
+/// Along one axis; at(k) is the value k pixels from the centre. By symmetry also the adjoint.
 template <typename T, class At> AR_HD T window_sum(const At& at) {
   // exp(-k^2 / (2 * 1.5^2)), normalised
   constexpr double kWeights[] = {0.26601172486179434341, 0.21300553771125369989, 0.10936068950970001069,

@@ -1,6 +1,5 @@
-// Structs that the stages of a frame read and write, on both devices. Pointers are views of host or device memory,
-// never owners. "[n]" is the shape of an array. A gradient of a symmetric matrix has its off-diagonal entries doubled
-// (Sym2 in vec.h).
+// Structs that the stages of a frame read and write, on both devices. Pointers own nothing. "[n]" is the shape of an
+// array. A gradient of a symmetric matrix has its off-diagonal entries doubled (Sym2 in vec.h).
 //
 //     project -> bin -> blend          forward
 //     blend_vjp -> project_vjp         backward
@@ -33,8 +32,8 @@ struct TileGrid {
 AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
-/// The tiles on CUDA if samples move. One sample in a large image is so cheap that larger tiles with fewer pairs pay;
-/// in a small one sixteen want shorter lists.
+/// The tiles on CUDA if samples move. One sample in a large image is so cheap that fewer pairs pay; sixteen in a small
+/// one want shorter lists.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
@@ -77,17 +76,17 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// Of a Gaussian: that of the camera's model, camera-space z, or the distance from the camera.
+/// The camera model's, camera-space z, or the distance from the camera.
 enum class DepthKind : int32_t { kNone, kOfModel, kZ, kDistance };
 
-/// Two more sums per splat, for density control: positive functions of each pixel's dL/dmean.
+/// Two more sums per splat, for density control: of each pixel's dL/dmean.
 enum class MeanSums : int32_t {
   kNone,
   kAbsolute,  ///< |dL/dx| and |dL/dy|, per px
   kNorm,      ///< length, in the units of GaussianGrads::means2d; the second sum is zero
 };
 
-/// Gradients by the members of Gaussians; null: not wanted.
+/// By the members of Gaussians; null: not wanted.
 template <typename T> struct GaussianGrads {
   /// Whether gradients are added, also to the `dL_dsh` of project_vjp.
   AR_HD static constexpr bool adds() { return false; }
@@ -205,7 +204,7 @@ template <typename T> struct ProjectedRows {
   T center = T(0);             ///< where pixels have their centres in means2d [px]
 };
 
-/// Of a camera's Gaussians, among the rows of all cameras.
+/// A camera's Gaussians among the rows of all cameras.
 struct RowPlaces {
   const int32_t* rows = nullptr;   ///< [n] row of a Gaussian, or -1
   const int32_t* ends = nullptr;   ///< [n] or else: rows up to and including this Gaussian's
@@ -285,7 +284,7 @@ template <typename T> struct PackedRows {
   int64_t first_id;      ///< of Gaussian 0
 };
 
-/// The numbers of rows may be any; a row that is no splat touches no tile.
+/// Rows may hold any numbers; one that is no splat touches no tile.
 template <typename T> struct ShapeRowsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< without colours: black

@@ -1,4 +1,4 @@
-// Small vectors and matrices: aggregates of scalars without padding, so that an array of them is an array of numbers.
+// Small vectors and matrices, without padding: an array of them is an array of numbers.
 #pragma once
 
 #include "core/lanes.h"
@@ -81,7 +81,6 @@ template <typename T> AR_HD Mat2<T> operator*(T s, const Mat2<T>& m) {
 template <typename T> AR_HD Lower2<T> operator*(T s, const Lower2<T>& m) { return {s * m.xx, s * m.yx, s * m.yy}; }
 template <typename T> AR_HD Mat2<T> all_of(const Mat2<T>& m) { return m; }
 template <typename T> AR_HD Mat2<T> all_of(const Lower2<T>& m) { return {m.xx, T(0), m.yx, m.yy}; }
-/// Scalar m, lanes v.
 template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.xy) * v.y), madd(V(m.yx), v.x, V(m.yy) * v.y)};
 }

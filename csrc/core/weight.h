@@ -1,4 +1,4 @@
-// The weight of one splat in one pixel, and its adjoint, for any footprint.
+// The weight of one splat in one pixel, and its adjoint.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -1,4 +1,4 @@
-// What training.h does to each Gaussian by itself. Sums over chunks are added in order, so that threads change no bit.
+// What training.h does to each Gaussian by itself. Sums over chunks are added in order.
 #include "core/activations.h"
 
 #include <algorithm>

@@ -1,5 +1,4 @@
-// The backward pass of the CPU, stage by stage in the order of Backend (torch/backend.h), called as forward.cpp is, and
-// the loops that each stage runs:
+// The backward pass of the CPU, called as forward.cpp is: its stages, and the loops that each runs.
 //
 //   blend_vjp      gradients of images to a row for each pair                 blend_vjp.h, blend_rays_vjp.h
 //   sum_channels   rows of pairs to gradients of channels                     sum_channels.h
@@ -33,8 +32,6 @@ template <typename T> void sum_camera_grads(const CameraGradSums<T>& sums) {
 }
 
 template <typename T> void row_grads(const RowGradsParams<T>& p) { stages_of<T>().row_grads(p); }
-
-// The adjoint of weight().
 
 template <typename T> void weight_vjp(int footprint, const WeightParams<T>& p) {
   stages_of<T>(footprint).weight_vjp(p);

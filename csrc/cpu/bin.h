@@ -1,5 +1,5 @@
-// Loops of bin: a stable counting sort of pairs by tile, over splats by depth. Between count_pairs() and
-// scatter_pairs() the caller allocates.
+// Loops of bin: a stable counting sort of pairs by tile, over splats by depth. After count_pairs() the caller
+// allocates.
 #pragma once
 
 #include <algorithm>

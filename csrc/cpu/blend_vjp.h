@@ -1,5 +1,5 @@
-// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first. Writes gradients per pair. A call is for a
-// window of channels.
+// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first, for a window of channels. Writes gradients
+// per pair.
 #pragma once
 
 #include "core/blend.h"
@@ -38,7 +38,7 @@ void load_background(const cpu::BlendVjpParams<T>& p, const TileView& view, T sa
     store(behind + i, sum);
   }
   if (!p.dL_dalpha) return;
-  // Alpha is a channel of black splats on a background of -1.
+  // Alpha is a channel with background -1.
   alignas(64) T dL_dalpha[kTilePixels] = {};
   load_tile<T>(view, p.grid, p.dL_dalpha, dL_dalpha);
   for (int i = 0; i < kTilePixels; ++i) behind[i] -= dL_dalpha[i] / samples;

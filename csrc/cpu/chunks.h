@@ -1,5 +1,4 @@
-// Loops over chunks of Gaussians, splats or weights, which threads share. A library for project.h, rows.h, bin.h,
-// weight.h and sum_channels.h.
+// Loops over chunks of Gaussians, splats or weights, which threads share.
 #pragma once
 
 #include <algorithm>

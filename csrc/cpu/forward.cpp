@@ -1,13 +1,12 @@
-// The forward pass of the CPU, stage by stage in the order of Backend (torch/backend.h), and the loops that each stage
-// runs. torch/backend_cpu.cpp allocates, fills the parameters of stages.h, and calls these functions.
+// The forward pass of the CPU: its stages, in the order of Backend (torch/backend.h), and the loops that each runs.
+// torch/backend_cpu.cpp allocates, fills the parameters of stages.h, and calls these functions.
 //
 //   project   Gaussians to splats, or to public rows             project.h, rows.h
 //   bin       splats to the list of each tile, sorted by depth   bin.h, sort.cpp
 //   blend     lists to images                                    blend.h, blend_rays.h
 //   inspect   lists to statistics of pixels and Gaussians        inspect.h
 //
-// The loops are compiled for several instruction sets. stages_of() is the table of the one that instruction_sets.cpp
-// chose. backward.cpp has the adjoints.
+// stages_of() is the table of the instruction set that instruction_sets.cpp chose. backward.cpp has the adjoints.
 #include <utility>
 
 #include "cpu/stages.h"

@@ -1,5 +1,4 @@
-// Loop of inspect: walks lists as blend does, and writes statistics of pixels and Gaussians (core/inspect.h). Threads
-// add with atomics.
+// Loop of inspect (core/inspect.h): walks lists as blend does. Threads add with atomics.
 #pragma once
 
 #include <cmath>

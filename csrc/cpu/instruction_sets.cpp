@@ -1,5 +1,4 @@
 // Chooses the instruction set, once per process, and fills tables of stages (stages.h) with functions of kernels_*.cpp.
-// forward.cpp and backward.cpp call stages_of() for a table.
 #include <cstdlib>
 #include <cstring>
 #include <vector>
@@ -66,8 +65,7 @@ const Stages<float>& avx512_stages(int footprint) {
 }
 #endif
 
-/// The best supported set, or that of the environment if supported: a variable from another machine must break no
-/// program.
+/// The best supported set, or that of the environment if supported: one from another machine must break no program.
 const InstructionSet& choose() {
   const char* wanted = std::getenv("ANALYTIC_RASTERIZER_ISA");
   for (const InstructionSet& set : instruction_sets()) {

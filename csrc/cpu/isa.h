@@ -1,5 +1,5 @@
-// Included by the loops of cpu/ in every kernels_*.cpp, which compiles them for one instruction set. That file defines
-// AR_ISA, the namespace of this set, so that the linker keeps sets apart, and AR_LANES, the floats of a register.
+// For the loops of cpu/. Every kernels_*.cpp compiles them for one instruction set, and defines AR_ISA, its namespace,
+// so that the linker keeps sets apart, and AR_LANES, the floats of a register.
 #pragma once
 
 #if !defined(AR_ISA) || !defined(AR_LANES)

@@ -1,5 +1,5 @@
-// The stages that every instruction set has. Blending works on packs. Projection and bin are scalar, and gain from
-// fused multiply-add and rounding instructions.
+// The stages that every instruction set has: blending, in packs, and projection and bin, which gain from fused
+// multiply-add and rounding instructions.
 #pragma once
 
 #include "core/footprint/registry.h"

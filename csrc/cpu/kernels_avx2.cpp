@@ -1,4 +1,4 @@
-// Compiles the loops of kernels.h for AVX2, in packs of 8 floats. instruction_sets.cpp uses them.
+// Compiles the loops of kernels.h for AVX2, in packs of 8 floats.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

@@ -1,4 +1,4 @@
-// Compiles the loops of kernels.h for AVX-512, in packs of 16 floats. instruction_sets.cpp uses them.
+// Compiles the loops of kernels.h for AVX-512, in packs of 16 floats.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

@@ -1,4 +1,4 @@
-// Compiles the loops of kernels_all.h for every machine, in packs of 4 floats. instruction_sets.cpp uses them.
+// Compiles the loops of kernels_all.h for every machine, in packs of 4 floats.
 #include "cpu/kernels_std.h"
 
 #define AR_ISA baseline

@@ -1,5 +1,4 @@
-// Compiles the loops of kernels_all.h in double, a pixel at a time. instruction_sets.cpp uses them for tests and
-// gradcheck.
+// Compiles the loops of kernels_all.h in double, a pixel at a time, for tests and gradcheck.
 #include "cpu/kernels_std.h"
 
 #define AR_ISA double_precision

@@ -1,5 +1,4 @@
-// Packs of float lanes, the type V of formulas per pixel: vectors of GCC and Clang, with intrinsics for missing
-// operations.
+// Packs of float lanes, a type V of formulas: vectors of GCC and Clang, with intrinsics for missing operations.
 #pragma once
 
 #include "core/constants.h"
@@ -166,7 +165,6 @@ AR_HD double sum(double a) { return a; }
 /// sum() of eight packs, to the bit.
 AR_HD void sum_lanes(const Pack (&packs)[8], float (&sums)[8]) {
 #if AR_LANES >= 8
-  // In the order of sum().
   __m256 halves[4], pairs[2];
   for (int i = 0; i < 4; ++i) {
     const __m256 a = eight_lanes(packs[i]), b = eight_lanes(packs[i + 4]);
@@ -186,7 +184,6 @@ AR_HD void sum_lanes(const double (&packs)[8], double (&sums)[8]) {
   for (int i = 0; i < 8; ++i) sums[i] = packs[i];
 }
 
-/// For tests and gradcheck.
 template <typename T> struct LanesOf;
 template <> struct LanesOf<float> {
   using Type = Pack;

@@ -1,5 +1,5 @@
-// Runs the loops of parallel_for() (parallel.h): a region of OpenMP whose threads take items from a shared counter.
-// team.h says how many threads it has. In a build without OpenMP the calling thread runs all items.
+// Runs the loops of parallel_for(): a region of OpenMP whose threads, as many as team.h says, take items from a shared
+// counter. Without OpenMP the calling thread runs all items.
 #include "cpu/parallel.h"
 
 #if defined(_OPENMP)
@@ -30,16 +30,15 @@ void run_alone(int64_t items, RunItem run, const void* body) {
 std::atomic<bool> is_forked{false};
 [[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
 
-/// By loop of the program: a short one may wait for threads that are in time for a long one. Never freed: threads may
-/// outlive main().
+/// By loop of the program, since a short one waits for threads that are in time for a long one. Never freed: threads
+/// may outlive main().
 struct Teams {
   std::mutex mutex;
   std::unordered_map<RunItem, TeamSize> sizes;
 };
 Teams& teams = *new Teams;
 
-/// `wanted`, or as many threads as the system has room for: GNU's OpenMP would end the process. Every calling thread
-/// has a team of its own.
+/// `wanted`, or as many threads as the system has room for: GNU's OpenMP would end the process.
 int threads_with_room(int wanted) {
   thread_local int proven = 1;
   if (wanted <= proven) return wanted;

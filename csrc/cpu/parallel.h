@@ -1,5 +1,4 @@
-// Loops whose items threads share: a library for the CPU path. Every item writes to its own memory: results do not
-// depend on the number of threads.
+// Loops whose items threads share. Every item writes to its own memory: results do not depend on the number of threads.
 #pragma once
 
 #include <cstdint>
@@ -13,8 +12,7 @@ using RunItem = void (*)(const void* body, int64_t item, int thread);
 void run_items(int64_t items, int threads, RunItem run, const void* body);
 
 /// body(item) or body(item, thread) for item in [0, items), in any order, on at most `threads` threads, numbered from
-/// 0. If body throws, items may be skipped, and the exception is thrown here. Loops may be nested, and begun by several
-/// threads at once.
+/// 0. If body throws, items may be skipped, and this throws. Loops may be nested, and begun by several threads at once.
 template <class Body> void parallel_for(int64_t items, int threads, const Body& body) {
   const RunItem run = [](const void* pointer, int64_t item, [[maybe_unused]] int thread) {
     const Body& body = *static_cast<const Body*>(pointer);

@@ -1,4 +1,4 @@
-// Prefetches rows that are read at random in memory. A library for tile.h and project.h.
+// Prefetches rows that are read at random in memory.
 #pragma once
 
 #include "core/stages.h"

@@ -102,7 +102,7 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
 /// Pairs from prefetch to use. Those of a splat are in many tiles.
 inline constexpr int64_t kPairsAhead = 16;
 
-/// The gradient of a splat: of the sums of its pairs, or else of a public row.
+/// Of the sums of a splat's pairs, or else of a public row.
 template <typename T> struct SplatGradOf {
   FootprintChoice footprint;
   const PairGrad<T>* sums;
@@ -120,8 +120,7 @@ template <typename T> struct GradsOrSums : GaussianGrads<T> {
   AR_HD bool adds_shs() const { return add; }
 };
 
-/// One copy for every kind of gradient: with a full camera it is a third of a megabyte, and takes ten seconds to
-/// compile.
+/// One copy for every kind of gradient: with a full camera it takes ten seconds to compile.
 template <class Cam, typename T>
 AR_ONE_COPY void gaussian_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const SplatGradOf<T>& grad_of,
                               const RowShownGrad<T>& shown, const GradsOrSums<T>& out, CameraGrad<T>* camera_grad) {

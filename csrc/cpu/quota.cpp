@@ -23,7 +23,7 @@ std::string content_of(const std::string& path) {
 /// Version 2 has one file, version 1 two.
 double quota_of(const std::string& folder) {
   long long quota = 0, period = 0;  // Microseconds.
-  // No such file, or no limit ("max"):
+  // No file, or no limit ("max"):
   if (std::sscanf(content_of(folder + "/cpu.max").c_str(), "%lld %lld", &quota, &period) != 2) {
     std::sscanf(content_of(folder + "/cpu.cfs_quota_us").c_str(), "%lld", &quota);
     std::sscanf(content_of(folder + "/cpu.cfs_period_us").c_str(), "%lld", &period);

@@ -77,8 +77,8 @@ template <class P, typename T> struct ReplayTile {
 
 /// Alphas, and positions before each pair, from the last pair of a tile to the first. Empty unless P moves.
 ///
-/// The walk back needs no exponentials. A full log begins anew: when the walk reaches earlier pairs, they are
-/// composited again from the nearest of kStates states. So memory does not depend on the list.
+/// The walk back needs no exponentials. A full log begins anew: earlier pairs are composited again from the nearest of
+/// kStates states, so that memory does not depend on the list.
 template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   using V = typename LanesOf<T>::Type;
   using Places = TilePlaces<P, T>;
@@ -87,7 +87,6 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
  public:
   static constexpr int kGroup = Places::kGroup;
 
-  /// As the log has it.
   struct Found {
     int first;              ///< Sample.
     const uint32_t* lanes;  ///< [kGroup] where the pair was composited.
@@ -120,7 +119,6 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
 
   AR_HD bool has(int32_t k) const { return entries_ != 0 && end_[-entries_].pair == k; }
 
-  /// First of the pack of take().
   AR_HD int pixel() const { return end_[-entries_].pixel; }
 
   /// A group into which the pair was composited. Groups of a pack follow each other.
@@ -148,7 +146,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   std::byte* memory() const { return reinterpret_cast<std::byte*>(tile_.memory); }
   States* kept_states() const { return reinterpret_cast<States*>(memory()); }
 
-  /// The log has numbers from its start, and entries from its end.
+  /// Numbers are at its start, entries at its end.
   void clear_log() {
     top_ = reinterpret_cast<T*>(kept_states() + kStates);
     end_ = reinterpret_cast<Entry*>(memory() + kBytes);

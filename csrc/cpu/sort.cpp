@@ -1,4 +1,4 @@
-// sort.h on several threads.
+// sort.h, on several threads.
 #include "cpu/sort.h"
 
 #include <algorithm>

@@ -1,5 +1,5 @@
 // ssim and ssim_vjp of training.h, in blocks of pixels. Window sums go along rows, then columns. Sums of blocks are
-// added in order: threads change no bit.
+// added in order.
 #include "core/ssim.h"
 
 #include <algorithm>
@@ -11,7 +11,7 @@
 namespace ar::cpu {
 namespace {
 
-/// Few columns, for the cache, and many rows, since two blocks read those at a border.
+/// Few columns, for the cache, and many rows: two blocks read those at a border.
 constexpr int kColumns = 128, kRows = 64;
 
 /// [top, bottom) x [left, right) of a plane.

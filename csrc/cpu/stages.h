@@ -1,5 +1,4 @@
 // Parameters of the CPU's stages beyond core/stages.h, and Stages, the table of functions that run them.
-// backend_cpu.cpp sets the parameters and owns all memory; forward.cpp and backward.cpp run the table.
 #pragma once
 
 #include <cstdint>
@@ -18,16 +17,15 @@ namespace ar::cpu {
 inline constexpr int64_t kChunk = 4096;
 AR_HD int64_t chunks_of(int64_t n) { return (n + kChunk - 1) / kChunk; }
 
-/// Numbers of a PairGrad.
 inline constexpr int kPairNumbers = sizeof(PairGrad<float>) / sizeof(float);
 
 /// Most channels per call of blend_vjp.
 inline constexpr int kWindow = 32;
 
-/// Per thread, for replay.h.
+/// Per thread.
 inline constexpr int64_t kReplayNumbers = int64_t(1) << 20;
 
-/// count_candidates marks Gaussians that may be visible. project writes their splats densely.
+/// count_candidates marks Gaussians that may be visible; project writes only theirs.
 template <typename T> struct ProjectParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
@@ -192,7 +190,7 @@ template <typename T> struct Stages {
   const CameraStages<T>& of(const CameraView<T>& camera) const { return camera.lens ? full : plain; }
 };
 
-/// Of the best instruction set, or of ANALYTIC_RASTERIZER_ISA. double has the baseline.
+/// Of the chosen instruction set; double has the baseline.
 template <typename T> const Stages<T>& stages_of(int footprint = 0);
 
 /// Of stages_of<float>.
@@ -206,21 +204,15 @@ struct InstructionSet {
 /// The widest first.
 const std::vector<InstructionSet>& instruction_sets();
 
-// forward.cpp.
-
-/// Returns the number of candidates.
 template <typename T> int64_t count_candidates(const ProjectParams<T>& p);
 template <typename T> void project(const ProjectParams<T>& p);
 template <typename T> void project_rows(const ProjectRowsParams<T>& p);
 template <typename T> void shape_rows(const ShapeRowsParams<T>& p);
-/// Returns the number of pairs.
 template <typename T> int64_t count_pairs(BinParams<T>& p);
 template <typename T> void scatter_pairs(BinParams<T>& p);
 template <typename T> void blend(int footprint, const BlendParams<T>& p);
 template <typename T> void inspect(int footprint, const InspectParams<T>& p);
 template <typename T> void weight(int footprint, const WeightParams<T>& p);
-
-// backward.cpp.
 
 template <typename T> void blend_vjp(int footprint, const BlendVjpParams<T>& p);
 template <typename T> void sum_channels(const SumChannelsParams<T>& p);

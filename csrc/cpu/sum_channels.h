@@ -1,5 +1,4 @@
-// Loop of sum_channels: adds up, per splat, the gradients of channels that blend_vjp made per pair. Runs after each
-// window of channels.
+// Loop of sum_channels, after each window of channels: adds up, per splat, the gradients that blend_vjp made per pair.
 #pragma once
 
 #include "cpu/project.h"

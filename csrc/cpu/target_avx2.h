@@ -1,4 +1,4 @@
-// From here to target_end.h functions are compiled for AVX2. kernels_avx2.cpp includes it.
+// From here to target_end.h functions are compiled for AVX2.
 #if defined(__clang__)
 #pragma clang attribute push(__attribute__((target("avx2,fma,bmi,bmi2"))), apply_to = function)
 #else

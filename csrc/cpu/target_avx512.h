@@ -1,4 +1,4 @@
-// From here to target_end.h functions are compiled for AVX-512. kernels_avx512.cpp includes it.
+// From here to target_end.h functions are compiled for AVX-512.
 #if defined(__clang__)
 #pragma clang attribute push(__attribute__((target("avx2,fma,bmi,bmi2,avx512f,avx512dq,avx512vl,avx512bw"))), \
                              apply_to = function)

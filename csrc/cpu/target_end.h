@@ -1,4 +1,4 @@
-// Ends target_avx2.h or target_avx512.h. Functions are compiled for the baseline again.
+// From here on functions are compiled for the baseline again.
 #if defined(__clang__)
 #pragma clang attribute pop
 #else

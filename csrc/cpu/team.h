@@ -1,6 +1,5 @@
 // How many threads a loop gets: a rule without a clock or threads of its own. A loop of OpenMP ends when all threads of
-// its team have come; beside other programs the last may come after all work is done. parallel.cpp asks before a loop
-// and then tells how late its threads were.
+// its team have come; beside other programs the last may come after all work is done.
 #pragma once
 
 #include <algorithm>
@@ -8,8 +7,8 @@
 
 namespace ar::cpu {
 
-/// Halves the team when loops lose more by waiting for late threads than they gain. Now and then tries twice as many;
-/// all trials cost a small part of the time. Times are in seconds.
+/// Halves the team when loops lose more by waiting for late threads than they gain. Now and then tries twice as many.
+/// Times are in seconds.
 class TeamSize {
  public:
   /// For the next loop, from 1 to `threads`.
@@ -33,7 +32,7 @@ class TeamSize {
     balance_ = 0;
   }
 
-  static constexpr double kCredit = 500e-6;  ///< Of a larger team, whose threads must be started.
+  static constexpr double kCredit = 500e-6;  ///< Of a larger team, which must be started.
   static constexpr double kRest = 32;        ///< Time before the next trial, in parts of what the last one lost.
 
  private:

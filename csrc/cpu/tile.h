@@ -1,5 +1,5 @@
-// Tiles on the CPU. Packs lay out a tile's pixels, reach_of() finds the packs that a splat reaches, and tile_splat()
-// prepares a splat.
+// Tiles on the CPU. Packs lay out a tile's pixels, reach_of() finds those that a splat reaches, tile_splat() prepares a
+// splat.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +15,7 @@ namespace ar::AR_ISA {
 
 inline constexpr int kTilePixels = kTile * kTile;
 
-/// Pack by pack, down each column of packs. A splat meets fewer of nearly square blocks than of rows.
+/// Down each column of packs. A splat meets fewer of nearly square blocks than of rows.
 template <typename T> struct Packs {
   static constexpr int kLanes = LanesOf<T>::kCount, kCount = kTilePixels / kLanes;
   static constexpr int kWidth = kLanes >= 8 ? 4 : kLanes >= 4 ? 2 : 1, kHeight = kLanes / kWidth;
@@ -110,7 +110,6 @@ void store_tile(const TileView& view, TileGrid grid, const Number* tile, Number*
 /// Of a pack, whose channels are adjacent: channel c is c * lanes farther.
 template <typename T> AR_HD T* channels_at(T* tile, int pixel, int channels) { return tile + pixel * channels; }
 
-/// Three channels of a splat, for registers.
 template <class V, typename T> AR_HD Vec3<V> three_channels(const T* shown, bool three) {
   return three ? Vec3<V>{V(shown[0]), V(shown[1]), V(shown[2])} : Vec3<V>{V(T(0)), V(T(0)), V(T(0))};
 }

@@ -1,5 +1,4 @@
-// Loops of footprint_weight and its adjoint: a weight per pair of covariance and offset (core/weight.h). Threads share
-// chunks of them.
+// Loops of footprint_weight and its adjoint: a weight per pair of covariance and offset (core/weight.h).
 #pragma once
 
 #include "core/weight.h"

@@ -159,8 +159,8 @@ struct BatchArguments : SceneArguments<std::vector<double>>, FootprintArguments 
   }
 };
 
-/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each. Harmonics and values may be (P, ...), (B, P, ...)
-/// or (C, P, ...).
+/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each; harmonics and values also (P, ...) or (C, P,
+/// ...).
 struct ProjectArguments : BatchArguments {
   OptionalTensor values;                        ///< (P, K), features after the colours.
   std::vector<int64_t> table;                   ///< Sizes (..., C, P) of a table with all rows, or none.
@@ -254,7 +254,7 @@ struct BlendArguments : ImageArguments {
   }
 };
 
-/// `bin` and `blend` in one, for rows as a table too, (..., 2) and (...,).
+/// `bin` and `blend` in one; rows may be a table, (..., 2) and (...,).
 struct CompositeArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, features;
   OptionalTensor background;   ///< (..., K), of the first channels, zero behind others.

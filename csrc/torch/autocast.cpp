@@ -1,5 +1,5 @@
-// Under torch.autocast the ops compute in float32: this kernel, which the dispatcher then calls first, casts arguments
-// of 16 bits. The cast is torch's: gradients have the dtype of the arguments.
+// Under torch.autocast the ops compute in float32: this kernel, then called first, casts arguments of 16 bits as torch
+// does: gradients have the dtype of the arguments.
 #include <torch/library.h>
 
 #include "torch/boxing.h"

@@ -1,6 +1,6 @@
-// The autograd node of all differentiable ops. In C++: a node from Python takes longer than the launches of a small
-// scene. That of `name` calls `name_vjp` with VjpArguments. Differentiable outputs come first: up to the first of
-// integers, or to the last list, `saved`. Adjoints have no derivative.
+// The autograd node of all differentiable ops. In C++: one from Python takes longer than the launches of a small scene.
+// That of `name` calls `name_vjp` with VjpArguments. Differentiable outputs come first: up to the first of integers, or
+// to the last list, `saved`. Adjoints have no derivative.
 #include <torch/csrc/autograd/autograd_not_implemented_fallback.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
@@ -16,7 +16,7 @@ using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 using torch::jit::Stack;
 
-/// What the schemas say, as indices of arguments.
+/// As indices of arguments.
 struct DifferentiableOp {
   c10::OperatorHandle forward, vjp;
   std::vector<size_t> tensors;
@@ -45,7 +45,7 @@ struct DifferentiableOp {
 bool is_given(const IValue& value) { return value.isTensor() && value.toTensor().defined(); }
 
 struct Node : torch::autograd::Function<Node> {
-  /// The node of an op that has run. Returns the tensors of all results; result k has sizes[k].
+  /// After the op has run. Returns the tensors of all results; result k has sizes[k].
   static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const DifferentiableOp* op,
                                const Stack* arguments, const Stack* results, std::vector<int64_t>* sizes) {
     Stack others = *arguments;  // Without tensors, which autograd saves.

@@ -1,5 +1,5 @@
-// Backend: a function per stage, and the tensors between stages. The ops allocate what all devices share;
-// backend_cpu.cpp and backend_cuda.cpp allocate the rest and run the stages (core/stages.h).
+// Backend: a function per stage, and the tensors between stages. The ops allocate what all devices share, backends the
+// rest.
 #pragma once
 
 #include <ATen/Context.h>
@@ -18,7 +18,7 @@
 
 namespace ar::ops {
 
-/// CPU: Gaussians that may be seen. CUDA: all, so that none must be counted.
+/// CPU: of Gaussians that may be seen. CUDA: of all, not to count them.
 struct SplatTensors {
   Tensor splats;       ///< (n, kSplatWidth).
   Tensor ids, depths;  ///< CPU: (n,), ids ascending.
@@ -179,7 +179,7 @@ struct FootprintSpec {
 
   bool along_rays() const { return window > 0; }
 };
-/// In keys of the order along rays, between a key of the registry and the size of the window: "moment4:ray24".
+/// Between a footprint's key and the size of the window: "moment4:ray24".
 inline constexpr std::string_view kRayMark = ":ray";
 FootprintSpec find_footprint(const std::string& key, double option);
 
@@ -203,7 +203,6 @@ struct Pass {
   }
 };
 
-/// Memory for what all devices have.
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
   if (!pass.keep) return {};
   const std::vector<int64_t> planes = {pass.footprint.samples, pass.grid.height, pass.grid.width};
@@ -220,7 +219,6 @@ class Backend {
   /// Whether `blend` or `inspect` writes this output, by its name in kImageSwitches or SummaryTensors.
   virtual bool writes(std::string_view output) const = 0;
 
-  // Forward.
   /// Writes radii (P,) int32, and its columns of `channels`.
   virtual SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                                const Tensor& radii) = 0;
@@ -240,7 +238,6 @@ class Backend {
   virtual void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs* in,
                        const SummaryTensors& summary) = 0;
 
-  // Backward.
   /// Where project_vjp, which must follow, writes nothing. May run beside blend_vjp.
   virtual void zero_culled_grads(const Inputs&, const ListTensors&, const Pass&, const Grads&) {}
   virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
@@ -252,7 +249,6 @@ class Backend {
   virtual Tensor project_rows_vjp(const Inputs& in, const ProjectedGrads& dL_drows, const Grads& grads) = 0;
   /// `parts`: what the two above returned. Adds up in double, in a fixed order.
   virtual void sum_camera_grads(const Tensor& parts, const Grads& grads) = 0;
-  /// Writes dL_drows.
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                          const RowTensors& dL_drows) = 0;
 
@@ -269,13 +265,12 @@ inline std::string& withheld_output() {
   return name;
 }
 
-/// Raises if the device does not write an output, which would reach the caller as it was allocated.
+/// Raises if the device does not write an output.
 inline void check_output(const Backend& backend, std::string_view name, const Tensor& like) {
   TORCH_CHECK_NOT_IMPLEMENTED(backend.writes(name) && name != withheld_output(), name, " cannot be made on ",
                               at::DeviceTypeName(like.device().type(), /*lower_case=*/true), " yet");
 }
 
-/// Memory for what `blend` writes.
 inline ImageTensors make_images(const Backend& backend, const ChannelTensors& channels, const ImageSwitches& wanted,
                                 TileGrid grid) {
   const at::TensorOptions options = channels.background.options();

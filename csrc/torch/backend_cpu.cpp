@@ -21,7 +21,7 @@
 namespace ar::ops {
 namespace {
 
-/// at::empty in huge pages: splats and pairs are new memory in every pass, visited in random order.
+/// at::empty in huge pages: splats and pairs are new in every pass, visited in random order.
 Tensor make_buffer(at::IntArrayRef sizes, const at::TensorOptions& options) {
   const Tensor buffer = at::empty(sizes, options);
 #if defined(__linux__)
@@ -138,7 +138,7 @@ template <typename T> class CpuBackend final : public Backend {
 
   ListTensors bin(const SplatTensors& splats, const Pass& pass) override {
     const TileGrid grid = pass.grid;
-    // If there is no memory for the image, raise before tiles are numbered.
+    // Without memory for the image, raise before tiles are numbered.
     if (grid.tiles() > kManyTiles) at::empty({grid.height, grid.width}, floats_);
     const int64_t n = splats.ids.size(0);
     ListTensors out;
@@ -195,7 +195,7 @@ template <typename T> class CpuBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     const int64_t pairs = lists.pairs.numel(), count = channels.count;
-    const bool own = !channels.rows.defined();  // Sums of the colours in the splats stay with the pairs.
+    const bool own = !channels.rows.defined();  // Sums of the splats' colours stay with the pairs.
     PairSums out;
     out.pairs = make_buffer({pairs, cpu::kPairNumbers + (own ? 3 : 0)}, floats_);
     if (mean_sums != MeanSums::kNone) out.means = at::empty({pairs, 2}, floats_);
@@ -302,7 +302,6 @@ template <typename T> class CpuBackend final : public Backend {
     return {const_pointer<RayDepth<T>>(lists.rays), pass.footprint.window};
   }
 
-  /// For project_vjp and row_grads.
   template <class Params> static void set_pair_sums(Params& p, const ListTensors& lists, const PairSums& sums) {
     p.pairs = splat_pairs_of(lists);
     p.threads = thread_count();

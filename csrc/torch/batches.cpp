@@ -1,5 +1,4 @@
-// Arguments of ops with several cameras, or batches of Gaussians: check_cameras() checks them, inputs_of() returns
-// those of one camera.
+// Arguments of ops with several cameras, or batches of Gaussians: checked, and those of one camera.
 #include <string>
 #include <type_traits>
 

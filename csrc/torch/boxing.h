@@ -48,7 +48,6 @@ template <char kLetter> void assign(const IValue& from, WrittenTensor<kLetter>& 
   static_cast<Tensor&>(to) = from.toTensor();
 }
 
-/// Takes an op's arguments off the stack.
 template <class Arguments> Arguments take(torch::jit::Stack& stack) {
   Arguments arguments;
   size_t count = 0;

@@ -1,4 +1,4 @@
-// The class Call of _C, by which Python calls ops (ops.py; call.cpp). ops.cpp adds it.
+// The class Call of _C, by which Python calls ops (ops.py; call.cpp).
 #pragma once
 
 #include <pybind11/pybind11.h>

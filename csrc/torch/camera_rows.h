@@ -1,11 +1,11 @@
-// Rows of splats lie camera after camera: selects the rows of one camera, for ops with several.
+// Selects the rows of one camera, for ops with several.
 #pragma once
 
 #include "torch/backend.h"
 
 namespace ar::ops {
 
-/// The rows of camera `c`, camera after camera by row_splits (C + 1,); undefined where `t` is.
+/// By row_splits (C + 1,); undefined where `t` is.
 inline Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
   if (!t.defined() || row_splits.numel() == 2) return t;  // of one camera all
   const int64_t* splits = row_splits.const_data_ptr<int64_t>();

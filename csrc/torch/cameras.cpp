@@ -1,6 +1,6 @@
 // The ops prepare_cameras and prepare_lens (core/camera/prepare.h), and their adjoints. Numbers stay on the host,
-// tensors on their device. What depends on a lens alone is found once if the host knows its numbers, else by the device
-// in every frame.
+// tensors on their device. Limits of a lens are found once if the host knows its numbers, else by the device in every
+// frame.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>

@@ -1,4 +1,4 @@
-// Checks of shapes, dtypes and devices, so that messages have one wording.
+// Checks of shapes, dtypes and devices, with one wording.
 #pragma once
 
 #include <algorithm>

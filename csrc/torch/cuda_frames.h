@@ -1,5 +1,5 @@
-// What backend_cuda.cpp keeps beyond a call: SharedGuesses, how many pairs frames had (pair_guess.h), and Laps, a
-// clock. And whether a frame's pairs are counted.
+// What backend_cuda.cpp keeps beyond a call: SharedGuesses (pair_guess.h) and Laps, a clock. And whether a frame's
+// pairs are counted.
 #pragma once
 
 #include <ATen/ops/empty.h>

@@ -1,4 +1,4 @@
-// Work on the current stream of a tensor's device: a library for cameras_cuda.cpp and training_cuda.cpp.
+// Work on the current stream of a tensor's device.
 #pragma once
 
 #include <ATen/core/Tensor.h>

@@ -1,5 +1,4 @@
-// The images of a rendering, and the channels that they are blended from. make_images() (backend.h) allocates images,
-// set_images() sets the pointers that kernels get.
+// The images of a rendering, and the channels that they are blended from.
 #pragma once
 
 #include <array>
@@ -59,12 +58,10 @@ template <typename T> Planes<T> planes_of(const ImageTensors& image, const Chann
   return planes;
 }
 
-/// Sets what `blend` writes.
 template <typename T> void set_images(BlendParams<T>& p, const ImageTensors& image, const ChannelTensors& channels) {
   p.image = planes_of<T>(image, channels);
   p.alpha = pointer<T>(image.others[kAlpha]);
 }
-/// Sets the gradients that `blend_vjp` reads.
 template <typename T>
 void set_images(BlendVjpParams<T>& p, const ImageTensors& dL_dimage, const ChannelTensors& channels) {
   p.dL_dimage = planes_of<const T>(dL_dimage, channels);

@@ -27,7 +27,7 @@ void observe(const void* kernel) {
 
 }  // namespace
 
-/// Forgets what was recorded, and begins or stops recording.
+/// Begins anew, or stops recording.
 void record_kernels(bool on) {
   const std::lock_guard lock(mutex);
   kernels().clear();

@@ -1,5 +1,5 @@
 // Registers the ops of ops.h with torch: a schema made from the arguments, and one kernel for all devices. And the
-// Python module _C, which loads them, with names, widths, and a few functions that are no ops.
+// Python module _C, with names, widths, and functions that are no ops.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>
@@ -25,8 +25,7 @@ namespace {
 
 using torch::jit::Stack;
 
-/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Only the message tells torch's error from
-/// others.
+/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Only its message tells it from others.
 template <class Work> auto with_memory_errors(const Work& work) {
   try {
     return work();

@@ -1,5 +1,5 @@
-// The ops, each for all devices, registered in ops.cpp, made differentiable in autograd.cpp and cast to float32 in
-// autocast.cpp. Comments list results in the order of the schema.
+// The ops, registered in ops.cpp, made differentiable in autograd.cpp and cast to float32 in autocast.cpp. Comments
+// list results in the order of the schema.
 #pragma once
 
 #include <string>
@@ -26,8 +26,8 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> a);
 /// lens (kLensWidth,).
 Results prepare_lens(PrepareLensArguments a);
 Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> a);
-/// The angle up to which a lens is a map, rad, and that at which its Jacobian is clamped; only an equirectangular lens
-/// needs `height`, px.
+/// The angles up to which a lens is a map, and its Jacobian not clamped, rad; only an equirectangular lens needs
+/// `height`, px.
 double lens_fold(const std::string& model, const std::vector<double>& distortion);
 double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
                   double y, int height);
@@ -67,7 +67,7 @@ Results bin(BinArguments a);
 Results blend(BlendArguments a);
 Results blend_vjp(VjpArguments<BlendArguments> a);
 
-/// The same summary, of the splats of `bin`: medians of the depths that are given, and ids that are rows.
+/// The same summary, of the splats of `bin`: of depths as given, and ids that are rows.
 Results inspect(InspectArguments a);
 
 Results footprint_weight(WeightArguments a);
@@ -106,7 +106,7 @@ Results add_noise(NoiseArguments a);
 /// Writes params, exp_avgs, exp_avg_sqs.
 Results adam(AdamArguments a);
 
-/// Whether autograd may have asked this process for a gradient.
+/// Whether autograd may have asked for a gradient.
 bool gradient_was_required();
 
 }  // namespace ar::ops

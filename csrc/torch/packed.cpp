@@ -64,7 +64,6 @@ Tensor checked_background(const Tensor& background) {
   return background.contiguous();
 }
 
-/// What `blend_rows` saves for its adjoint.
 struct SavedRows {
   static constexpr size_t kStateFirst = ListTensors::kMembers, kKeptFirst = kStateFirst + BlendState::kMembers;
   static constexpr size_t kMembers = kKeptFirst + KeptRows::kMembers;

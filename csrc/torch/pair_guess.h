@@ -1,5 +1,5 @@
-// How much room to reserve for the pairs of a frame, guessed from earlier ones. Host code, for torch/backend_cuda.cpp:
-// the device writes the number into host memory, where a later frame reads it.
+// How much room to reserve for the pairs of a frame, guessed from earlier ones. The device writes the number into host
+// memory, where a later frame reads it.
 #pragma once
 
 #include <algorithm>
@@ -20,15 +20,13 @@ struct PairGuessPolicy {
   static constexpr int kReservedRoom = 1 << 16;
 };
 
-/// Whether the host waits for the count.
 enum class Counting {
   kNever,     ///< no room where nothing is known
   kIfNeeded,  ///< while few frames are known
   kAlways,
 };
 
-/// Rounds up by at most an eighth, to one of eight numbers in each octave: torch's allocator reuses buffers of few
-/// sizes, and keeps a block for every size.
+/// Rounds up to one of eight numbers in each octave: torch's allocator keeps a block for every size.
 inline int64_t in_steps(int64_t number) {
   int64_t step = 1;
   while (number > 16 * step) step *= 2;
@@ -91,7 +89,7 @@ class PairGuess : PairGuessPolicy {
   Frame recent_[kRecent] = {};
 };
 
-/// Images that share a guess: their numbers of tiles are between the same powers of two.
+/// Images that share a guess: with numbers of tiles between the same powers of two.
 struct ImageClass {
   int device = -1, tile_bits = 0;
   int octave = 0;  ///< bits of the number of tiles
@@ -105,7 +103,7 @@ struct ImageClass {
   }
 };
 
-/// Of the classes used last, each with a word that the device writes. The number of the frame tells if the slot has
+/// Of the classes used last, each with a word that the device writes; by the frame's number it tells if the slot has
 /// another class by then.
 class PairGuesses {
  public:

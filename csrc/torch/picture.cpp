@@ -1,6 +1,6 @@
 // The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients
-// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would, in the same
-// order, without its cost to the host.
+// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would, without its
+// cost to the host.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
 #include <ATen/ops/cat.h>
@@ -66,7 +66,7 @@ struct Rasterized {
   }
 };
 
-/// The same of an equirectangular picture, between whose stages splats are repeated. The host waits for their number.
+/// The same of an equirectangular picture, whose splats are repeated. The host waits for their number.
 struct Sphere {
   RasterizeArguments scene;
   ProjectArguments camera;
@@ -200,7 +200,6 @@ L1SsimArguments comparison_of(const LossArguments& a, const Tensor& image) {
   return comparison;
 }
 
-/// The loss of a rendering, and its gradients.
 struct Loss {
   Tensor value, shown;  ///< (), and the image as compared with the target, but for the mask.
   Tensor dL_drendered, dL_dexposure;
@@ -239,7 +238,6 @@ struct DepthLoss {
   }
 };
 
-/// What the two ways of rendering have in common.
 template <class Rendering> Results gradients_through(const PictureArguments& a, const Rendering& render) {
   const ActivateArguments parameters = parameters_of(a);
   const Results activated = activate(parameters);

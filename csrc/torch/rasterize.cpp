@@ -1,5 +1,5 @@
 // The ops `rasterize` and `rasterize_timed` (check, project, bin, blend), `rasterize_vjp` (blend_vjp, project_vjp) and
-// `inspect`, which looks at lists of `bin`. They call a Backend (backend.h) stage by stage.
+// `inspect`, which looks at lists of `bin`.
 #include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/tensor.h>
@@ -102,7 +102,6 @@ SummaryTensors make_summary(const Backend& backend, const SummarySwitches& wante
   return out;
 }
 
-/// What ops return of it.
 std::vector<Tensor> results_of(SummaryTensors summary, at::ScalarType type) {
   if (summary.total.defined()) summary.total = summary.total.to(at::kDouble).mul_(kWeightUnit).to(type);
   std::vector<Tensor> out;
@@ -194,8 +193,8 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     }
 
     const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
-    // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses memory that blend_vjp frees.
-    // And before the backend, whose destructor waits for it.
+    // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses what blend_vjp frees. And
+    // before the backend, whose destructor waits.
     Grads grads = make_grads(a, needs);
     grads.mean_sums = mean_sums;
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);

@@ -1,7 +1,7 @@
 // The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are the same line of the
 // sphere, with a row for every place at which a splat may show (docs/internals/numerics.md, "Equirectangular
-// pictures"). And its adjoint. A splat wider than the turn overlaps itself: its opacity is lowered, so that its copies
-// together are as opaque as it was at its centre.
+// pictures"). And its adjoint. A splat wider than the turn overlaps itself: the opacity of its copies is lowered, to be
+// together what it was at the centre.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/exp.h>
@@ -47,8 +47,8 @@ struct Narrowed {
   Tensor overlaps() const { return cov2d.select(1, 0).gt(turn.mul(kOverlapping).square()); }
 };
 
-/// The equation prod_k (1 - o w_k) = 1 - opacity for the opacity o of a copy, w_k being the splat's falloff at k turns.
-/// In x = -ln(1 - o) the logarithm of the product is concave: Newton's method rises to the solution.
+/// Solves prod_k (1 - o w_k) = 1 - opacity for the opacity o of a copy, w_k being the splat's falloff at k turns. In x
+/// = -ln(1 - o) the product's logarithm is concave: Newton's method rises to the solution.
 struct CopyOpacity {
   Tensor falloff;  ///< (kNeighbours, n).
   Tensor wanted;   ///< -ln(1 - opacity).
@@ -183,7 +183,7 @@ Results repeat_at_seam_vjp(VjpArguments<SeamArguments> arguments) {
     const Tensor by_opacity = at::where(below, dL_dwanted.div(at::where(below, a.opacities, 0).neg().add(1)), 0);
     dL_dopacities = at::where(overlaps, by_opacity, dL_dopacities);
   }
-  // A wide splat has the variance of the turn: its own says only how its correlation is narrowed.
+  // A wide splat has the turn's variance: its own only narrows its correlation.
   const Tensor dL_dfactor = dL_dxy.mul(a.cov2d.select(1, 1)).mul(narrowed.factor), wide = narrowed.wide;
   dL_dturn = dL_dturn.add(at::where(wide, dL_dxx.mul(narrowed.turn).mul(2 * kWidest * kWidest), 0));
   dL_dturn = dL_dturn.add(at::where(wide, dL_dfactor.div(narrowed.turn), 0));

@@ -1,4 +1,4 @@
-// A second stream for torch/backend_cuda.cpp, one per thread and device, whose kernels run beside the caller's stream.
+// A second stream, one per thread and device, whose kernels run beside the caller's stream.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -22,7 +22,7 @@ class SideStream {
   cudaStream_t stream() const { return own_.stream; }
   /// For LaunchShape::begun of a kernel on stream().
   cudaEvent_t begun() const { return own_.begun; }
-  /// Later kernels of the caller's stream wait for the blocks of that kernel to begin, which else would wait for room.
+  /// Later kernels of the caller's stream wait for that kernel's blocks to begin, else these would wait for room.
   void wait_until_begun() const { cudaStreamWaitEvent(caller_, own_.begun, 0); }
 
  private:

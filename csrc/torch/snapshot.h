@@ -1,4 +1,4 @@
-// Writes the arguments of a failed op to a file, for settings with debug=True. `rasterize` and its adjoint use it.
+// Writes the arguments of a failed op to a file, for settings with debug=True.
 #pragma once
 
 #include <torch/csrc/jit/serialization/pickle.h>

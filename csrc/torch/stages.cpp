@@ -1,5 +1,5 @@
 // The stages after `project` as separate ops, for one or several cameras: bin, blend and its adjoint. And
-// footprint_weight. Lists are returned camera after camera.
+// footprint_weight.
 #include <ATen/ops/cat.h>
 #include <ATen/ops/stack.h>
 #include <ATen/ops/zeros_like.h>

@@ -1,5 +1,5 @@
 // The ops of a training step besides rendering: loss, activations, 3D filter, colour correction, density control
-// (observe_, add_noise_) and optimiser, with adjoints. They check, allocate, and call TrainingKernels (training.h).
+// (observe_, add_noise_) and optimiser, with adjoints.
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -8,7 +8,6 @@
 namespace ar::ops {
 namespace {
 
-/// Checks the images. Allocates `partials` if wanted.
 SsimTensors make_ssim(SsimArguments& a, bool keep) {
   check(a);
   SsimTensors t;
@@ -26,7 +25,6 @@ std::vector<Tensor> saved_of(const SsimTensors& t) {
   return t.partials.defined() ? std::vector<Tensor>{t.partials} : std::vector<Tensor>{};
 }
 
-/// Checks images and `saved`. Allocates the gradient.
 SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, const std::vector<bool>& needs) {
   SsimTensors t = make_ssim(a, false);
   check_needs(needs, 2);

@@ -1,6 +1,5 @@
-// TrainingKernels: what the ops of training.cpp ask of a device, and parameters of kernels from tensors.
-// training_cpu.cpp and training_cuda.cpp implement it. Tensors are checked and contiguous, or undefined: absent or not
-// wanted.
+// TrainingKernels: what the ops of training.cpp ask of a device, and parameters of kernels from tensors. Tensors are
+// checked and contiguous, or undefined: absent or not wanted.
 #pragma once
 
 #include <cmath>
@@ -49,7 +48,7 @@ struct CorrectTensors {
   Tensor dL_dimage, dL_dmatrix;
 };
 
-/// They run on the device's current stream.
+/// On the device's current stream.
 class TrainingKernels {
  public:
   virtual ~TrainingKernels() = default;
@@ -83,7 +82,6 @@ template <class Visit> void visit_scalars(const SsimTensors& t, const Visit& vis
   if (!is_double && !is_uint8) visit(float(), float());
 }
 
-/// For ssim and its adjoint.
 template <typename T, typename Target, class Params> void set_images(Params& p, const SsimTensors& t) {
   p.height = int(t.image.size(-2));
   p.width = int(t.image.size(-1));
@@ -118,7 +116,6 @@ template <class Visit> void visit_scalar(const Tensor& parameters, const Visit& 
   visit(float());
 }
 
-/// For activate and its adjoint.
 template <typename T, class Params> void set_parameters(Params& p, const ActivateTensors& t) {
   p.n = t.log_scales.size(0);
   p.log_scales = const_pointer<Vec3<T>>(t.log_scales);
@@ -150,7 +147,6 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   return p;
 }
 
-/// For apply_filter and its adjoint.
 template <typename T, class Params> void set_filter(Params& p, const FilterTensors& t) {
   p.n = t.scales.size(0);
   p.scales = const_pointer<Vec3<T>>(t.scales);
@@ -177,7 +173,6 @@ template <typename T> FilterVjpParams<T> filter_vjp_params(const FilterTensors& 
   return p;
 }
 
-/// For correct_colors and its adjoint.
 template <typename T, class Params> void set_correction(Params& p, const CorrectTensors& t) {
   p.pixels = t.image.numel() / 3;
   p.image = const_pointer<T>(t.image);

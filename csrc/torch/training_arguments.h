@@ -73,7 +73,7 @@ struct CorrectArguments {
 struct LossArguments {
   Tensor target, dL_dloss;  ///< As of `l1_ssim`.
   OptionalTensor exposure;  ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor mask;      ///< (H, W) of the share of each pixel that counts, by which both images are multiplied.
+  OptionalTensor mask;      ///< (H, W) of the share of each pixel that counts: a factor of both images.
   double ssim_weight = 0;
   int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
 

@@ -39,7 +39,7 @@ int64_t span_of(const Tensor& t) {
   return last + t.element_size();
 }
 
-/// Whether two tensors alternate in memory, as columns of a matrix do: modulo a stride, their addresses are disjoint
+/// Whether two tensors alternate in memory, as columns of a matrix: modulo a stride, their addresses are disjoint
 /// intervals.
 bool are_interleaved(const Tensor& a, const Tensor& b) {
   const auto extents_a = extents_of(a), extents_b = extents_of(b);
@@ -57,7 +57,7 @@ bool are_interleaved(const Tensor& a, const Tensor& b) {
          std::any_of(extents_b.begin(), extents_b.end(), by_stride);
 }
 
-/// If written memory belonged to two tensors, the result would depend on the order.
+/// With written memory in two tensors the result would depend on the order.
 void check_overlaps(const AdamArguments& a) {
   struct Range {
     const char *begin, *end;

@@ -1,5 +1,4 @@
-// TrainingKernels (training.h) for CPU tensors, float32 or float64. Calls the loops of cpu/training.h on thread_count()
-// threads.
+// TrainingKernels (training.h) for CPU tensors, float32 or float64.
 #include "cpu/training.h"
 #include "torch/backend.h"
 #include "torch/training.h"

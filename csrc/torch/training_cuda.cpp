@@ -1,5 +1,4 @@
-// TrainingKernels (training.h) for CUDA tensors, float32 or float64. Launches the kernels of cuda/training/. Never
-// waits for the device.
+// TrainingKernels (training.h) for CUDA tensors, float32 or float64. Never waits for the device.
 #include <ATen/ops/empty.h>
 
 #include "cuda/training/training.h"

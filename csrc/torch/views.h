@@ -139,14 +139,12 @@ template <typename T> PackedRows<T> packed_rows_of(const PackedTensors& packed) 
   return out;
 }
 
-/// For `project` and `project_rows`.
 template <typename T, class Params> void set_projection(Params& p, const Inputs& in, const Pass& pass) {
   p.camera = camera_of<T>(in);
   p.gaussians = gaussians_of<T>(in);
   p.footprint = pass.footprint.choice;
   p.bounds = cull_bounds<T>(pass.footprint.choice);
 }
-/// For `project` alone.
 template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensors& channels) {
   p.channels = channel_rows<T>(channels.rows, channels);
   if (!channels.given.defined()) return;
@@ -155,7 +153,6 @@ template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensor
   p.given.count = int(p.given.stride);
 }
 
-/// For `project_vjp` and `project_rows_vjp`.
 template <typename T, class Params> void set_projection_vjp(Params& p, const Inputs& in, const Grads& grads) {
   p.camera = camera_of<T>(in);
   p.gaussians = gaussians_of<T>(in);

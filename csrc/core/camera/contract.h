@@ -109,7 +109,7 @@ template <typename T> struct VelocityGrad {
   Vec3<T> p, w;
 };
 
-/// For a Jacobian proportional to the focal lengths.
+/// Of a Jacobian proportional to the focal lengths.
 template <typename T>
 AR_HD void add_focal_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, const JacobianGrad<T>& grad,
                          CameraGrad<T>& to) {
@@ -117,7 +117,7 @@ AR_HD void add_focal_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, cons
   to.lens.tan_half_fov.y -= dot(grad.y, j.y) / camera.lens.tan_half_fov.y;
 }
 
-/// Rays meet at the camera's position; the depth is z, and so is that of a thin lens.
+/// Rays meet at the camera's position; the depth is z, also for a thin lens.
 struct CameraModelDefaults {
   template <typename T> AR_HD static T depth(Vec3<T> view) { return view.z; }
   template <typename T> AR_HD static Vec3<T> depth_vjp(Vec3<T>, T dL_ddepth) { return {T(0), T(0), dL_ddepth}; }

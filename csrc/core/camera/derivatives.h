@@ -1,5 +1,5 @@
-// Numbers that carry derivatives along, so that a camera model writes its map once. Dual has the gradient by a point in
-// space, Line the derivative in one direction, and a Dual of Lines the gradient's change in that direction.
+// Numbers with derivatives, so that a camera model writes its map once. Dual has the gradient by a point in space, Line
+// the derivative in one direction, a Dual of Lines the gradient's change in that direction.
 #pragma once
 
 #include "core/vec.h"

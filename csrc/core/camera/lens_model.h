@@ -1,6 +1,6 @@
 // Makes all of core/camera/contract.h from the map of a lens. The Jacobian is the exact derivative of the map, but for
 // one clamp: beyond `reach` it is that of a ray turned back to `reach`, as 3DGS does with pinholes. Second derivatives
-// come from the same map with other numbers (derivatives.h).
+// come from numbers of derivatives.h.
 //
 // A model inherits PerspectiveLens, DistanceLens or WideLens, which inherit LensModel, and defines, for S float, double
 // or a Line, and N an S or a Dual<S>:

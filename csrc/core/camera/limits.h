@@ -1,5 +1,5 @@
-// How far a lens is a map, and a picture sees through it: `fold` and `reach` of core/lens.h, by rays in many directions
-// and at many angles. In double: near a fold derivatives cancel.
+// `fold` and `reach` of core/lens.h: how far a lens is a map, and a picture sees through it, by rays at many angles. In
+// double: near a fold derivatives cancel.
 #pragma once
 
 #include <limits>
@@ -32,13 +32,12 @@ template <typename T> AR_HD LimitKind limit_kind(const Lens<T>& lens) {
 /// Where the model has coefficients.
 AR_HD bool may_fold(LimitKind kind) { return kind == LimitKind::kTangent || kind == LimitKind::kAngle; }
 AR_HD double widest_angle(LimitKind kind) { return kind == LimitKind::kAngle ? kPi - 1e-3 : kWidestPerspective; }
-/// As the kernels read it.
 AR_HD double measured(LimitKind kind, double angle) {
   if (kind == LimitKind::kLatitude) return 1 / std::cos(angle);
   return kind == LimitKind::kAngle ? angle : std::tan(min(angle, kWidestMeasured));
 }
 
-/// At the origin, with a picture in focal lengths from the principal point, without limits.
+/// At the origin, without limits; the picture is in focal lengths from the principal point.
 AR_HD FullCamera<double> bare_camera(const Lens<double>& lens) {
   const double inf = std::numeric_limits<double>::infinity();
   FullCamera<double> camera = {};

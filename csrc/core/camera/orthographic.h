@@ -1,5 +1,4 @@
-// The orthographic model: all rays are parallel to the camera's axis, and the Jacobian is the same at every mean. w of
-// clip space must be 1.
+// All rays are parallel to the camera's axis, and the Jacobian is the same everywhere. w of clip space must be 1.
 #pragma once
 
 #include "core/camera/clip_space.h"

@@ -1,5 +1,5 @@
-// From what users give of a camera to what kernels read, and the adjoint: the matrices of a pose and intrinsics
-// (CameraSource), and a Lens of numbers and tensors (LensSource). In double, rounded once.
+// From a user's camera to what kernels read, and the adjoint: the matrices of a pose and intrinsics (CameraSource), and
+// a Lens of numbers and tensors (LensSource). In double, rounded once.
 #pragma once
 
 #include "core/camera/limits.h"

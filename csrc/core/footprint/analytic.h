@@ -46,7 +46,7 @@ template <class V> struct LogisticWindow {
 
   AR_HD LogisticWindow(V t, const LogisticAxis<T>& axis) {
     const V one = V(T(1)), distance = abs(t);
-    // Keeps products of four such factors finite; F is then below 1e-17.
+    // Keeps products of four factors finite; F is then below 1e-17.
     lower = exp2(min(logistic_base2(distance - V(axis.half)), V(T(40 * kLog2e))));
     upper = exp2(-logistic_base2(distance + V(axis.half)));
     numerator = one_minus_exp(madd(V(axis.square) * t, t, V(axis.constant)), lower * upper);

@@ -1,5 +1,5 @@
 // The footprint `box`: the pixel as S equal Gaussians at the nodes of box_node<S>, each with its own transmittance. The
-// pixel's colour is the mean over the samples. gaussian.h has what blending calls.
+// pixel's colour is the mean over the samples.
 #pragma once
 
 #include "core/footprint/gaussian.h"

@@ -1,5 +1,5 @@
 // The contract of a footprint: from a projected Gaussian to its weight I in a pixel. A footprint F is a struct of
-// static functions and constants, and a line in registry.h; all else gets F as a template argument. How to write one:
+// static functions and constants, and a line in registry.h; all else gets F as a template argument. See
 // docs/internals/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
@@ -106,7 +106,6 @@ struct FootprintOptions {
   double number;
 };
 
-/// By its index in the registry.
 struct FootprintChoice {
   int index;
   FootprintOptions options;
@@ -124,7 +123,7 @@ template <class V> struct AlphaGrad {
   V dL_dalpha, weighted;
 };
 
-/// Sums over pixels, whose meaning is the footprint's.
+/// Sums over pixels, as the footprint defines them.
 template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;

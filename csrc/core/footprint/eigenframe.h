@@ -1,12 +1,11 @@
-// The eigenframe of a covariance, for analytic.h and erf.h, whose windows are along the axes of a splat and which
-// differentiate it themselves.
+// The eigenframe of a covariance, for analytic.h and erf.h, which differentiate it themselves.
 #pragma once
 
 #include "core/footprint/contract.h"
 
 namespace ar {
 
-/// Standard deviations along the axes of a covariance, and (cos, sin) of the major axis.
+/// Standard deviations along both axes, and (cos, sin) of the major one.
 template <typename T> struct Eigenframe {
   Vec2<T> sigma;
   Vec2<T> axis;

@@ -158,7 +158,7 @@ struct Exact : FootprintDefaults {
   template <typename T, class V> AR_HD static Moments<V> by_strips(const Terms<T>& t, const Pixel<V>& pixel) {
     const V zero = V(T(0)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
     const V along = V(t.along), across = V(t.across), scale = V(T(1) / max(t.tilt, T(kMinTilt)));
-    // Steps in z.x to two edges of the pixel, and to the crossings of the ridge with the others.
+    // Steps in z.x to two edges of the pixel, and to where the ridge crosses the others.
     const V edge = along * pixel.wide.begin, opposite = along * pixel.wide.end;
     const V first = min(edge, opposite), last = max(edge, opposite);
     const V enters = madd(across, pixel.narrow.begin, pixel.z.y) * scale;

@@ -1,6 +1,6 @@
-// Shared by the footprints that are Gaussians: point, mip, box and moment, and in part by others. A Gaussian is stored
-// as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 is never positive, and does not
-// cancel for long needles as the conic form does (docs/internals/numerics.md, "Whitening").
+// Shared by the footprints that are Gaussians: point, mip, box and moment, and in part by others. Stored is a whitening
+// matrix w, w^T w = (Sigma + v I)^-1: the exponent -|w d|^2 / 2 is never positive, and does not cancel for long needles
+// as the conic form does (docs/internals/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -30,7 +30,7 @@ template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
   return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
 }
 
-/// In these coordinates the boxes of BoxReach (bin.h) are smaller.
+/// Makes the boxes of BoxReach (bin.h) smaller.
 template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
   const Lower2<T>& w = shape.w;
   const bool wide_x = shape.x_given_y == T(0);

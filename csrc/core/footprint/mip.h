@@ -1,5 +1,4 @@
-// The footprint `mip`, the 2D filter of Mip-Splatting: the Gaussian convolved with a Gaussian pixel. gaussian.h has
-// what blending calls.
+// The footprint `mip`, the 2D filter of Mip-Splatting: the Gaussian convolved with a Gaussian pixel.
 #pragma once
 
 #include "core/footprint/gaussian.h"

@@ -12,8 +12,8 @@ template <int S> struct MomentKey {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
 };
 
-/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian at its centre. `Pixels` is reset, because nodes of
-/// the base class do not move.
+/// n x n cells, S = n^2. At first a cell is a Gaussian at its centre. `Pixels` is reset: nodes of the base class do not
+/// move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
   static constexpr const char* kPage = "moving";
@@ -150,8 +150,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
-  /// step() alpha / (1 - alpha). In the divisor the factor is free on a device. Without fused multiply-adds it is
-  /// rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings.
+  /// step() alpha / (1 - alpha). In the divisor the factor is free on a device. Without fused multiply-adds the error
+  /// is up to 1 / (1 - kAlphaMax) = 100 roundings.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha) {
     const V per_step = V(T(1 / step<Cell>()));
     return divide(alpha, madd(-per_step, alpha, per_step));

@@ -1,4 +1,4 @@
-// For erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval.
+// Gauss-Legendre rules, and moments of the normal density over an interval.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -1,5 +1,4 @@
 // The footprint `point`, that of 3DGS (2023): the value of the Gaussian, widened by `dilation`, at the pixel centre.
-// gaussian.h has what blending calls.
 #pragma once
 
 #include "core/footprint/gaussian.h"

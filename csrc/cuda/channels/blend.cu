@@ -1,7 +1,6 @@
 // Launches blend_groups (groups.cuh): the forward pass for any number of channels, in groups of 32 or 8.
 //
-// Tried and lost (docs/internals/log.md, "More than four channels" and "Features that are gone"): backward, batches of
-// 32 or 128 splats; a warp per splat in sum_channels; lists cut into segments.
+// Tried and lost: docs/internals/log.md, "More than four channels" and "Features that are gone".
 #include "cuda/channels/groups.cuh"
 
 namespace ar::cuda {

@@ -15,8 +15,7 @@ template <int C> struct alignas(C / 2) Eighth {
 };
 
 /// A lane computes the weights of its own pixel, but sums a quarter of the C channels of four pixels, which share a
-/// load from shared memory. Pixel i of lane l is the own pixel of lane l ^ 8 i. Lane l has eighths l / 4 and l / 4 ^ 1
-/// of the channels.
+/// load. Pixel i of lane l is the own pixel of lane l ^ 8 i. Lane l has eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 

@@ -1,8 +1,8 @@
 // Kernel blend_groups_vjp: the backward pass for one group of channels; later groups add to pair_grads. A block per
 // tile, a warp per subtile, walks the list back to front; lanes share channels as in groups.cuh.
 //
-// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair. MeanSums are not:
-// for them the first group makes all sums of shapes, and reads the channels of all groups.
+// dL/dalpha is linear in the image's gradient: each group adds its share to the sums of a pair. MeanSums are not: for
+// them the first group makes all sums of shapes, from the channels of all groups.
 #pragma once
 
 #include "cuda/channels/groups.cuh"
@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   if (all_at_once) {
     for (int c = C; c < channel_count; ++c) through += gradient(c) * params.background[c];
   }
-  // Alpha is 1 - transmittance: like a channel whose background is -1.
+  // Alpha is a channel with background -1.
   if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   float transmittance[S], farther[S];  // as in blend_sample_vjp, after the list
   AR_UNROLL for (int s = 0; s < S; ++s) {

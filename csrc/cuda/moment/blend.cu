@@ -1,8 +1,7 @@
 // Launches the forward pass of footprints whose samples move. Where lists are cut into segments (cut_lists.h), filter
 // runs once. Then, for each group of channels, listed_blend takes the lists that are cut, and moving_blend the others.
 //
-// Tried and lost (docs/internals/log.md, the sections "moment/" and "The queue"): eight lanes per pixel in large
-// images; a queue in all lists with 4 samples; backward, a warp per tile as in still/, and whole lists as one segment.
+// Tried and lost: docs/internals/log.md, the sections "moment/" and "The queue".
 #include "cuda/dispatch.h"
 #include "cuda/moment/listed.cuh"
 #include "cuda/moment/walk.cuh"

@@ -1,11 +1,11 @@
-// What the kernels of moment/ share. A pixel of such a footprint F has F::kSamples square cells, each with a sample,
-// which is evaluated at a node that moves in the cell with every splat composited. CellLayout says which lane has which
-// samples, MovingSamples is their state and its checkpoints, MovingStage a batch of splats in shared memory, and
-// MovingBlend the forward pass of a lane: it composites splats and writes images.
+// What the kernels of moment/ share. A pixel has F::kSamples square cells, each with a sample, evaluated at a node that
+// moves in the cell with every splat composited. CellLayout says which lane has which samples, MovingSamples is their
+// state and its checkpoints, MovingStage a batch of splats in shared memory, and MovingBlend the forward pass of a
+// lane.
 //
 // Template parameters in moment/: F is the footprint, C the number of channels, kSide the side of the tiles [px],
-// Layout a CellLayout, kSegment the pairs of a segment. kKeep: what a backward pass needs is stored. Functions that
-// vote, shuffle or wait must be called by all lanes of a warp.
+// Layout a CellLayout, kSegment the pairs of a segment. kKeep: for a backward pass. All lanes of a warp must call
+// functions that vote, shuffle or wait.
 #pragma once
 
 #include "cuda/moment/cut_lists.h"
@@ -21,9 +21,9 @@ __device__ inline int& claimed_group() {
   return groups[threadIdx.x / 32];
 }
 
-/// How the samples of a tile are spread over lanes. A lane has kCellsOfLane neighbouring cells of a row, a pixel
-/// kLanesOfPixel neighbouring lanes (a power of two), and a warp a rectangle of pixels, called a group. kClaimed: warps
-/// claim one group after another. kWarpsOfGroup: warps with different samples of the same pixels.
+/// A lane has kCellsOfLane neighbouring cells of a row, a pixel kLanesOfPixel neighbouring lanes (a power of two), and
+/// a warp a rectangle of pixels, called a group. kClaimed: warps claim one group after another. kWarpsOfGroup: warps
+/// with different samples of the same pixels.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
           int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kClaimed = false,
           int kWarpsOfGroup = 1>
@@ -154,7 +154,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   }
 };
 
-/// A splat at a node. All kernels call see(), so that alpha always has the same bits.
+/// A splat at a node. All kernels call see(), so that alpha has the same bits.
 struct Seen {
   Vec2<float> z;
   float raw;

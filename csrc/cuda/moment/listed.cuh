@@ -1,8 +1,8 @@
 // Kernels filter and listed_blend: the forward pass for lists that are cut into segments. A tile may have hundreds of
-// thousands of splats, most of them smaller than a pixel. So `filter` tests every pair against every pixel, and writes
-// bits to reach_words. `listed_blend` composites in a pixel only splats that reach it, from a queue (queue.cuh), or
-// walks those that reach any of a warp's few pixels. It writes what moving_blend does, but for checkpoints within later
-// segments, which segment_maps stores.
+// thousands of splats, most smaller than a pixel. So `filter` tests every pair against every pixel, and writes bits to
+// reach_words. `listed_blend` composites in a pixel only splats that reach it, from a queue (queue.cuh), or walks those
+// that reach any of a warp's few pixels. It writes what moving_blend does; segment_maps stores the checkpoints within
+// later segments.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -143,7 +143,7 @@ __device__ void blend_listed(const BlendParams& params, int first, const CutList
       uint32_t left = stage.template reached<Layout>(from, count);
       if (!blend.samples.open()) left = 0;
       __syncwarp();
-      // Each step waits for the step before it; meanwhile the next splat is read.
+      // While a step waits for the one before, the next splat is read.
       int j = __clz(int(left)) % 32;
       TileSplat<F, C> splat = stage.splats[j];
       int k = k0 + stage.numbers[from + j];
@@ -170,7 +170,7 @@ template <class F> inline constexpr int kListedWarps = MomentPolicy::listed_warp
 template <class F, int kSide> struct ListedLayouts {
   static constexpr int kWarps = kListedWarps<F>;
   using Longest = AheadLayout<F, kSide, 1, kWarps>;
-  /// For all but the longest lists: queues with one sample, walks with four. With more there are no such lists.
+  /// Not for the longest lists: queues with one sample, walks with four. With more there are no such lists.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = CellLayout<1, 16, kSide, kWarps>;  ///< from kLongList pairs on
@@ -195,8 +195,8 @@ template <class F, int C, int kSide> union WarpStage {
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
-/// A block has a pixel of one of the longest lists, which come first, or each of its warps a few pixels of another
-/// list. Writes the channels [first, first + C).
+/// A block has a pixel of one of the longest lists, which come first, or each warp a few pixels of another list. Writes
+/// the channels [first, first + C).
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // moving_blend_kernel need not wait for filter_kernel

@@ -1,7 +1,7 @@
-// Kernels segment_maps and chain_maps: the first steps of the backward pass for lists that are cut. The Adjoint of a
-// sample goes through a segment as an affine map. `segment_maps` writes the map of each segment but the first to
-// adjoint_maps, and the checkpoints that blend did not store. `chain_maps` applies the maps from the last segment to
-// the first, and replaces them by what segment_vjp begins with.
+// Kernels segment_maps and chain_maps: the first steps of the backward pass for lists that are cut. A segment is an
+// affine map of a sample's Adjoint. `segment_maps` writes those of all segments but the first to adjoint_maps, and the
+// checkpoints that blend did not store. `chain_maps` applies them, last segment first, and replaces them by what
+// segment_vjp begins with.
 #pragma once
 
 #include <algorithm>
@@ -48,7 +48,7 @@ template <class F, int kTilePixels> struct MapMemory {
   }
 };
 
-/// For segments. Most have small splats, so that few pixels for each warp are best.
+/// For segments. Most have small splats: few pixels per warp are best.
 template <class F, int kSide>
 using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
                                          CellLayout<2, 8, kSide>>;
@@ -56,8 +56,8 @@ using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTil
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 
-/// A block has a segment and 1 / kBlocks of its tile. The first segment of a list needs no maps, and blend has stored
-/// its checkpoints. Reads the channels [first, first + C).
+/// A block has a segment and 1 / kBlocks of its tile. The first segment of a list needs no maps. Reads the channels
+/// [first, first + C).
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
 __global__ void __launch_bounds__(Layout::kThreads,
                                   blocks_per_sm(MomentPolicy::kMapThreads / Layout::kThreads, Layout::kThreads))

@@ -1,4 +1,4 @@
-// When moment/ cuts lists, how long segments are, and launch shapes, chosen by measuring, with what they trade.
+// When moment/ cuts lists, length of segments, and launch shapes, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {
@@ -14,8 +14,8 @@ struct MomentPolicy {
   /// Resident threads of moving_blend.
   static constexpr int blend_threads(int channels) { return channels == 3 ? 1024 : 0; }
 
-  /// In large images lists of so many pairs are cut, or of a block's share (kListBlocksPerSm) if that is more. A cut
-  /// list is more work, which blocks share.
+  /// In large images lists of so many pairs are cut, or of a block's share (kListBlocksPerSm) if more. A cut list is
+  /// more work, which blocks share.
   static constexpr int kLongList = 4096;
   static constexpr int kListBlocksPerSm = 4;
   /// Pairs of a segment. Longer segments need fewer maps, shorter ones fill a device with smaller scenes.
@@ -29,9 +29,9 @@ struct MomentPolicy {
 
   /// Pairs that a block of filter tests at once.
   static constexpr int kFilterPiece = 256;
-  /// In large images most of the device is left to moving_blend, which begins beside filter and listed_blend.
+  /// In large images moving_blend, which begins beside filter and listed_blend, needs most of the device.
   static constexpr int kFilterBlocksPerSm = 2, kListedWarpsPerSm = 8;
-  /// Longest lists in small images of which each warp of listed_blend has one task.
+  /// Longest lists in small images: each warp of listed_blend has one task.
   static constexpr int kLongestAtOnce = 128;
   /// Warps of listed_blend that share a pixel of the longest lists.
   static constexpr int listed_warps(int samples) { return samples == 1 ? 1 : 4; }
@@ -42,7 +42,7 @@ struct MomentPolicy {
   static constexpr int vjp_threads(int channels, int cells_of_lane, bool segments) {
     return channels > 3 ? 512 : cells_of_lane > 2 && !segments ? 768 : 1024;
   }
-  /// Resident threads of segment_maps.
+  /// Resident threads.
   static constexpr int kMapThreads = 1024;
   /// Segments whose maps chain_maps loads at once.
   static constexpr int kMapsAhead = 8;

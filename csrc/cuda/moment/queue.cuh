@@ -1,6 +1,6 @@
-// How listed_blend (listed.cuh) composites a pixel by a queue. The pixel's lanes read its bits from filter, and queue
-// the splats that reach it, so it does not wait for splats that reach only its neighbours. Lanes that share a sample
-// test several queued splats at once. For the longest lists all warps of a block have one pixel.
+// How listed_blend composites a pixel by a queue of the splats that reach it, by the bits of filter, without waiting
+// for those of its neighbours. Lanes that share a sample test several queued splats at once. For the longest lists all
+// warps of a block have one pixel.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
@@ -20,7 +20,6 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   }
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
-  /// Lanes with the same sample.
   __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
   __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
   /// All threads must call it.
@@ -52,8 +51,7 @@ template <class F, int kSide> __device__ int64_t pixel_words(int first, const Ti
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
-/// Checkpoints that listed_blend stores: all in the first segment, and one before each other. segment_maps stores the
-/// remaining ones side by side.
+/// Checkpoints that listed_blend stores: all in the first segment, and one before each other.
 template <int kSegment> struct CheckpointsAhead {
   int pair;  ///< after the next checkpoint
   float* to;
@@ -109,7 +107,7 @@ template <class Layout> struct PairQueues {
       uint32_t to = end + uint32_t(up_to - found);
       for (; mine != 0; mine &= mine - 1) pairs[to++ % kRoom] = before + __ffs(int(mine));
       end += uint32_t(shuffle(up_to, lane_id() | (Layout::kLanes - 1)));
-      // Straight into their register: nothing waits for them yet.
+      // Into their register: nothing waits for them yet.
       next += wants ? kAtOnce : 0;
       bits = wants ? 0 : bits;
       if (wants && has_bits()) bits = words[next / kBits];
@@ -142,7 +140,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
-    // By all lanes, straight into the registers: the compiler would wait to copy what only some lanes read.
+    // By all lanes, into registers: the compiler would wait to copy what only some read.
     splat = load_splat<F>(splats_in, next_id);
     channels = channels_of<C>(channels_in, splat, next_id, first_channel);
     take_next(queues);
@@ -157,7 +155,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
   ///
   /// The comparison is never true: level > 0, and x_given_y >= 0. It keeps these registers in use until the splat
-  /// arrives. `light` makes the compiler compare after the steps.
+  /// arrives; by `light` it comes after the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
     if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
@@ -165,9 +163,8 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
 };
 
-/// Composites n staged splats of this lane's pixel, from first_staged on. Most show in no sample, so the lanes of a
-/// sample test kAhead at once and composite the first that shows; then the node has moved, and they test the later ones
-/// again.
+/// Composites n staged splats of this lane's pixel, from first_staged on. The lanes of a sample test kAhead at once and
+/// composite the first that shows; then the node has moved, and they test the later ones again.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;

@@ -1,5 +1,5 @@
-// What a lane of the backward kernels of moment/ carries through a list (VjpLane): `last` and the gradient of the image
-// for its pixel, and the Adjoint that goes from splat to splat.
+// What a lane of the backward kernels of moment/ carries through a list (VjpLane): `last`, the image's gradient for its
+// pixel, and the Adjoint.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
@@ -38,7 +38,7 @@ template <class F, int C> struct SampleGrad {
       for (int c = C; c < params.channels.count; ++c)
         through += sample_gradient<F>(params, pixel, c) * params.background[c];
     }
-    // Alpha is 1 - transmittance: a channel with background -1.
+    // Alpha is a channel with background -1.
     if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   }
 

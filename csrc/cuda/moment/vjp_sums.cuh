@@ -41,7 +41,7 @@ template <class F, int C, class Layout, int kPairs, bool kInside> struct VjpBatc
   }
 
  private:
-  /// kUsed sums of a pair: a constant, so that divisions by it cost little.
+  /// kUsed: sums of a pair, a constant for cheap divisions.
   template <int kUsed, class Total>
   __device__ void write_first(const BlendVjpParams& params, int first, WantedSums<C> wanted, const TileList& list,
                               int count, Total&& total) const {

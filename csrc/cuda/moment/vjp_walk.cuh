@@ -1,6 +1,6 @@
 // Kernel moving_vjp: the backward pass for lists that are not cut. The state before a splat does not follow from that
-// after it. So a warp composites each chunk of 32 splats again from the checkpoint before it, stores the positions
-// before each splat, and walks back over the splats that its pixels show. segment_vjp shares batch_vjp and launch_vjp.
+// after it: a warp composites each chunk of 32 splats again from the checkpoint before it, stores positions, and walks
+// back over the splats that its pixels show. segment_vjp shares batch_vjp and launch_vjp.
 #pragma once
 
 #include <algorithm>
@@ -16,8 +16,7 @@ template <int C, class Layout, bool kSegments>
 inline constexpr int kMovingVjpBlocks = blocks_per_sm(
     std::max(MomentPolicy::vjp_threads(C, Layout::kCells, kSegments) / Layout::kThreads, 1), Layout::kThreads);
 
-/// Before each splat of a chunk that reaches the warp. The first in_shared are in shared memory, the others in local
-/// memory.
+/// Before each splat of a chunk that reaches the warp: the first in_shared in shared memory, others in local memory.
 template <class Layout> struct EarlierPositions {
   static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
   struct alignas(kTogether * sizeof(Vec2<float>)) Together {

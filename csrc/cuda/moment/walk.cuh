@@ -1,6 +1,5 @@
-// Kernel moving_blend: the forward pass for lists that are not cut. A block walks the whole list of a tile, since the
-// position of a node depends on all earlier splats. It writes images, and for a backward pass transmittance, `last` and
-// checkpoints.
+// Kernel moving_blend: the forward pass for lists that are not cut. A block walks the whole list of a tile. It writes
+// images, and for a backward pass transmittance, `last` and checkpoints.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -14,14 +13,14 @@ inline constexpr int kMovingBlocks =
 
 /// Block b has tile plan.tile_order[b], unless its list is cut; the last block only waits
 /// (begin_beside_earlier_kernels). Writes the channels [first, first + C). `beside`: listed_blend_kernel was launched
-/// just before. kKeep: writes checkpoints as TileCheckpoints and MovingSamples lay them out.
+/// just before.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
   if (begin_beside_earlier_kernels(beside)) return;
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   constexpr int kListed = kKeep ? kStateChunk : kBatch;
-  // Last entries of many samples would take too many registers.
+  // Against registers for last entries of many samples.
   constexpr bool kLists = !kKeep || Layout::kCells <= 2;
   using Stage = MovingStage<F, C, Layout, kBatch, kListed, true>;
   __shared__ Stage stage;

@@ -1,8 +1,7 @@
 // Launches blend_front and the tail (front.cuh, tail.cuh): the forward pass of footprints whose samples stay, for up to
 // four channels.
 //
-// Tried and lost (docs/internals/log.md, "still/, forward" and "still/, backward"): two pixels in a lane; lists of half
-// warps; backward, chunks of 128 pairs, and two subtiles at a time for `cumulant` and `analytic`.
+// Tried and lost: docs/internals/log.md, "still/, forward" and "still/, backward".
 #include "cuda/dispatch.h"
 #include "cuda/still/front.cuh"
 #include "cuda/still/tail.cuh"

@@ -1,7 +1,6 @@
 // Kernel blend_front: the forward pass of footprints whose samples stay, for up to four channels. It composites the
 // front, the first chunks of a list, until all pixels have stopped. The kernels of tail.cuh composite the other chunks
-// side by side, so that a few tiles with long lists fill the device too (docs/internals/kernels.md, "Forward: front and
-// tail").
+// side by side, so that a few long lists fill the device too (docs/internals/kernels.md, "Forward: front and tail").
 #pragma once
 
 #include "cuda/launch.cuh"

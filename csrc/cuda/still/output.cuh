@@ -1,5 +1,5 @@
-// What blend_front and the tail share: addresses of a pixel's checkpoints (PixelCheckpoints, TransmittancePlanes);
-// store_pixel() writes a finished pixel, accumulate_farther() the checkpoints where blend_vjp starts.
+// What blend_front and the tail share: addresses of a pixel's checkpoints, and writing a finished pixel and the
+// checkpoints where blend_vjp starts.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"
@@ -50,7 +50,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   }
 };
 
-/// For kernels that are compiled once for all S, C and kKeep.
+/// For kernels compiled once for all S, C and kKeep.
 struct TransmittancePlanes {
   float* base;
   int first_chunk;
@@ -99,8 +99,8 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> to
   if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
 
-/// Replaces the channels of chunks [first, end) by those of everything farther, where blend_vjp starts. `farther`:
-/// beyond the last of these. kBatch chunks are loaded before the first store, to wait together.
+/// Replaces the channels of chunks [first, end) by those of everything farther. `farther`: beyond the last of these.
+/// kBatch chunks are loaded before the first store, to wait together.
 template <int kBatch, int S, int C>
 __device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
                                    Values<C> farther) {

@@ -1,13 +1,13 @@
-// Length of the front and launch shapes of the kernels of still/, chosen by measuring, with what they trade.
+// Length of the front and launch shapes of still/, chosen by measuring, with what they trade.
 #pragma once
 
 namespace ar::cuda {
 
 /// F: what a lane blends. Blocks: resident on a multiprocessor, for more latency hidden with fewer registers.
 struct StillPolicy {
-  /// Splats between two votes on whether any sample is open.
+  /// Splats between votes on whether any sample is open.
   static constexpr int kBetweenVotes = 16;
-  /// Chunks of the front in small images, and the least in others. The tail takes more work, which blocks share.
+  /// Chunks of the front in small images, and the least in others. The tail is more work, which blocks share.
   static constexpr int kShortFront = 1, kLongFront = 8;
 
   template <class F> static constexpr int kFrontBlocks = F::kSamples > 1 ? 1 : F::kExpensive ? 4 : 5;

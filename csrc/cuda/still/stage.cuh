@@ -1,5 +1,5 @@
-// How blend_front and the tail composite: a block stages splats, each warp lists those that reach its pixels, and
-// composite_all() blends them.
+// How blend_front and the tail composite: a block stages splats, and each warp lists and blends those that reach its
+// pixels.
 #pragma once
 
 #include <type_traits>

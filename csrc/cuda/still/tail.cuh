@@ -48,8 +48,8 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
   });
 }
 
-/// The next splat, with alpha >= kAlphaMin, stops a sample with less transmittance. The margin covers rounding, which
-/// differs between chunks and splats.
+/// With less transmittance the next splat stops a sample. The margin covers rounding, which differs between chunks and
+/// splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -60,7 +60,7 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
 /// Of 32 pixels, a block each.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// Transmittance at the begin of a chunk is negative if the sample has stopped. `samples`: of a lane.
+/// Transmittance before a chunk is negative if the sample has stopped. `samples`: of a lane.
 __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = StillPolicy::kTailLoads;

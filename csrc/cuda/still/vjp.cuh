@@ -1,6 +1,6 @@
 // Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. A warp goes through a
 // chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp makes the sums of a
-// pair, without atomics, whose order changes from run to run; only tiles of a patch use them.
+// pair, without atomics, whose order varies; only tiles of a patch use them.
 #pragma once
 
 #include "cuda/launch.cuh"

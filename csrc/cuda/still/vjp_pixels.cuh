@@ -1,4 +1,4 @@
-// The pixels of a tile in a warp of blend_vjp, one of each subtile per lane, in registers or in shared memory.
+// The pixels of a tile in a warp of blend_vjp, one of each subtile per lane, in registers or shared memory.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"
@@ -14,7 +14,7 @@ template <class F, int C> inline constexpr bool kHoldsPixels = kHoldsSamples<C> 
 /// Whether two subtiles, one below the other, share a branch: independent instructions, against visits in vain.
 template <class F, int C> inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && !F::kExpensive;
 
-/// Whether each subtile has its own code, which saves the address computations.
+/// Whether each subtile has its own code, without address computations.
 template <class F, int C>
 inline constexpr bool kUnrollsSubtiles = kHoldsSamples<C> || (F::kSamples == 1 && !F::kExpensive);
 
@@ -44,7 +44,6 @@ struct VjpSample {
   float transmittance, behind;
 };
 
-/// Pixels of a warp in shared memory.
 template <class F, int C> struct SharedPixels {
   VjpPixels<F::kSamples, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
   VjpSample samples[F::kSamples][kHoldsSamples<C> ? 1 : kTilePixels];
@@ -85,7 +84,7 @@ template <class F> constexpr int visited_subtile(int k) {
   return F::kSamples == 1 && !F::kExpensive ? (k & 4) | (k & 1) << 1 | (k >> 1 & 1) : k;
 }
 
-/// Calls visit(b, position_in(b, of_first)) for the subtiles b of a set.
+/// visit(b, position_in(b, of_first)) for the subtiles b of a set.
 template <class F, int C, class Visit>
 __device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> of_first, Visit&& visit) {
   if constexpr (kTakesTwo<F, C>) {

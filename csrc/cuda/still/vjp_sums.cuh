@@ -1,5 +1,4 @@
-// Splats that a warp of blend_vjp has listed, and PairSums, which adds the sums of eight pairs over the lanes in shared
-// memory.
+// Splats that a warp of blend_vjp has listed, and PairSums, which adds the sums of eight pairs over lanes.
 #pragma once
 
 #include "cuda/still/vjp_pixels.cuh"

@@ -80,7 +80,7 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
         transmittance = abs(c.transmittance);
         behind = dot(g, c.channels) / transmittance;
       }
-      // Alpha is 1 - transmittance: like a channel whose background is -1.
+      // Alpha is a channel with background -1.
       if (params.dL_dalpha && i >= 0) {
         const float open = final ? 1 : params.transmittance[sample_index<F>(chunk.image, i, s)] / transmittance;
         behind -= scale * params.dL_dalpha[i] * open;
@@ -105,7 +105,6 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       uint32_t reach = 0;
       Mat2<float> mean_map = {0, 0, 0, 0};
       __syncwarp();  // all have read the last batch
-      // A lane per pair.
       Splat<F, float> own;
       int32_t id = 0, row = 0;
       if (k < k1) {
@@ -179,7 +178,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// The pixel of subtile b is at p. `at`: the pair, by reference because the compiler else turns comparisons around.
+  /// The pixel of subtile b is at p. `at`: the pair, by reference, or the compiler turns comparisons around.
   template <MeanSums kKind>
   __device__ void add_pixel(const ListedSplat<F, C>& splat, const int& at, const Mat2<float>& mean_map, int b,
                             Vec2<float> p, ShapeGrad<float>& shape, float& weighted, Values<C>& channels,
@@ -199,7 +198,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
       const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
       pixels_.sample(s, b) = sample;
       F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, shape);
-      // Again for the pixel alone: MeanSums must not change a bit of the other sums.
+      // Again for the pixel alone: MeanSums change no bit of other sums.
       if (kMeans) F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, of_pixel);
       contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
       weighted += grad.of_alpha.weighted;
