@@ -22,10 +22,13 @@ LINK = re.compile(r"`[^`]+`|(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\(
 
 # By class: figures on white, which a dark page shows inverted; figures whose labels a phone can read, side by side
 # where there is room.
-FIGURES = {
-    "plot": ("growth",),
-    "small": ("moving", "conventions", "accuracy_time", "errors_weight", "footprints_one", "footprints_two"),
-}
+PHONE = ("moving", "conventions", "accuracy_time", "errors_weight", "footprints_one", "footprints_two", r"gallery/\w+")
+FIGURES = {"plot": ("growth",), "small": PHONE}
+# A photograph and its rendering in one paragraph become one picture with a divider between them.
+PAIR = re.compile(r"<p>(<img[^>]*_photograph\.[^>]*>)\s*(<img[^>]*_rendering\.[^>]*>)</p>")
+DIVIDED = """<div class="divided">\\1\\2<span>photograph</span><span>rendering</span>
+<input type="range" value="50" aria-label="Divider between photograph and rendering"
+  oninput="this.parentNode.style.setProperty('--at', this.value + '%')"></div>"""
 NAMES = re.compile(r"(?<!\[)`([A-Za-z_][\w.]*)`")
 
 log = logging.getLogger("mkdocs.hooks.links")
@@ -52,11 +55,11 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_page_content(html, page, config, files):
-    """Figures get their class."""
+    """Figures get their class, pairs their divider."""
     for name, files_of in FIGURES.items():
         figures = rf'<img(?=[^>]*src="[^"]*images/(?:{"|".join(files_of)})\.[^"]*")'
         html = re.sub(figures, f'<img class="{name}"', html)
-    return html
+    return PAIR.sub(DIVIDED, html)
 
 
 def with_names(markdown):
