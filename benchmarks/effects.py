@@ -225,6 +225,7 @@ ROWS = {
     "filter_3d": (EffectCase.plain, EffectCase.filter_3d),
     "defocus": (EffectCase.plain, EffectCase.defocus),
     "motion": (EffectCase.plain, EffectCase.motion),
+    "order:ray": (EffectCase.plain, effect(order="ray")),
     "sh_degree:0": (EffectCase.plain, effect(sh_degree=0)),
     "sh_degree:4": (lambda case: case.with_degree(3), lambda case: case.with_degree(4)),
 }
