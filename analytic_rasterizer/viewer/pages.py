@@ -6,6 +6,7 @@ from importlib import resources
 
 MODULES = (
     "constants.js",
+    "formulas.js",
     "sh.js",
     "camera.js",
     "frame.wgsl.js",

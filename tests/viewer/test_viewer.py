@@ -561,7 +561,7 @@ def test_polynomials_are_those_of_the_headers():
 def test_shaders_have_no_numbers_of_their_own():
     """Whatever is not in constants.js or sh.js is a small number of a formula."""
     for name in JAVASCRIPT:
-        if name.startswith("webgl_shaders") or (name.endswith(".wgsl.js") and name != "present.wgsl.js"):
+        if name.startswith(("webgl_shaders", "formulas")) or name.endswith(".wgsl.js"):
             found = set(re.findall(r"(?<![\w.])\d+\.\d{3,}", pages.page_file(name)))
             assert found <= {"0.4366", "0.6240", "0.6975"}, (name, found)
 

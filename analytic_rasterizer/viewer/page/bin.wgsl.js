@@ -2,7 +2,7 @@
 
 import { FRAME, MAIN, TILE, WORKGROUP, bindings } from './frame.wgsl.js';
 import { KINDS } from './footprint.wgsl.js';
-import { GROUP_SCAN, SORT_BLOCK, scanOf } from './sort.wgsl.js';
+import { SORT_BLOCK, groupScan, scanOf } from './sort.wgsl.js';
 
 // A splat in more tiles than these is written by a whole workgroup.
 const LARGE = 32;
@@ -56,7 +56,7 @@ fn main() {
 }`;
 
 /// How many tiles the visible splats of each workgroup of emit have.
-export const SCAN_REDUCE = `${GROUP_SCAN}
+export const SCAN_REDUCE = `${groupScan()}
 ${bindings('read counts: array<u32>', 'read order: array<u32>', 'read tiles: array<u32>', 'write blocks: array<u32>')}
 ${MAIN}
   let at = block.x * ${WORKGROUP}u + t;
@@ -67,7 +67,7 @@ ${MAIN}
 }`;
 
 /// Sums over them; the number of pairs, and workgroups for them. Sums end at 2^32 - 1, beyond what there is room for.
-export const SCAN_BLOCKS = `${FRAME}${GROUP_SCAN}
+export const SCAN_BLOCKS = `${FRAME}${groupScan()}
 ${bindings(
   'uniform frame: Frame', 'write counts: array<u32>', 'write blocks: array<u32>', 'write arguments: array<u32>')}
 var<workgroup> number: u32;
@@ -83,7 +83,7 @@ ${MAIN}
 }`;
 
 /// A thread writes the pairs of a splat in few tiles; the workgroup together those of the others.
-export const emit = kind => `${FRAME}${GROUP_SCAN}${KINDS[kind].functions}
+export const emit = kind => `${FRAME}${groupScan()}${KINDS[kind].functions}
 ${bindings(
   'uniform frame: Frame', 'read counts: array<u32>', 'read order: array<u32>', 'read blocks: array<u32>',
   'read tiles: array<u32>', 'read splats: array<Splat>', 'write keys: array<u32>', 'write values: array<u32>')}

@@ -7,7 +7,6 @@ import { FRAME, TILE, bindings } from './frame.wgsl.js';
 
 const BATCH = TILE * TILE;  // splats in workgroup memory at once: one for each thread
 
-/// `footprint` is an entry of `footprints` of the scene.
 export function blend(footprint) {
   const { slots, functions, terms, pixel, alpha } = KINDS[footprint.kind], { nodes } = sampling(footprint);
   const each = make => nodes.map((_, s) => make(s, sampleOf(footprint, s))).join('\n');

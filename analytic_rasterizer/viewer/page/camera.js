@@ -24,7 +24,7 @@ function turned(v, axis, angle) {
 }
 
 /// The quaternion of a rotation matrix, given by its rows.
-export function quaternionOf([x, y, z]) {
+function quaternionOf([x, y, z]) {
   const trace = x[0] + y[1] + z[2];
   const q = trace > 0
     ? [1 + trace, z[1] - y[2], x[2] - z[0], y[0] - x[1]]
@@ -37,7 +37,7 @@ export function quaternionOf([x, y, z]) {
 }
 
 /// Rows of the rotation matrix of a quaternion.
-export function rotationOf(quaternion) {
+function rotationOf(quaternion) {
   const [w, x, y, z] = unit(quaternion);
   return [
     [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -115,31 +115,26 @@ export class Camera {
     };
   }
 
-  /// Turns about the target, by angles, so that the scene turns to the right and down.
+  /// Turns about the target, by angles, so that the scene turns to the right about up, then down about the x axis.
   orbit(right, down) {
-    const { target } = this;
-    const angle = Math.acos(Math.min(Math.max(dot(this.axes[2], this.up), -1), 1));
+    const { target } = this, angle = Math.acos(Math.min(Math.max(dot(this.axes[2], this.up), -1), 1));
     // A view of a file may look more steeply than the limit: then turning is free until it is within.
     const free = angle < STEEPEST || angle > Math.PI - STEEPEST;
     const wanted = free ? angle + down : Math.min(Math.max(angle + down, STEEPEST), Math.PI - STEEPEST);
-    this.turn(-right, angle - wanted);
-    this.position = add(target, times(this.axes[2], -this.distance));
+    const level = this.axes.map(axis => turned(axis, this.up, -right));
+    const axes = level.map(axis => turned(axis, level[0], angle - wanted));
+    const x = unit(axes[0]), forward = unit(minus(axes[2], times(x, dot(axes[2], x))));
+    this.axes = [x, cross(forward, x), forward];
+    this.position = add(target, times(forward, -this.distance));
   }
 
-  /// Turns on the spot: to the left about up, then upwards about the camera's own x axis.
-  turn(yaw, pitch) {
-    const turnedAxes = this.axes.map(axis => turned(axis, this.up, yaw));
-    const axes = turnedAxes.map(axis => turned(axis, turnedAxes[0], pitch));
-    const right = unit(axes[0]), forward = unit(minus(axes[2], times(right, dot(axes[2], right))));
-    this.axes = [right, cross(forward, right), forward];
+  /// Moves along the axes of the camera, right, down and forward, world units.
+  move(...steps) {
+    for (const [i, step] of steps.entries()) this.position = add(this.position, times(this.axes[i], step));
   }
 
-  /// Moves along the axes of the camera, world units.
-  move(right, down, forward) {
-    [right, down, forward].forEach((step, i) => {
-      this.position = add(this.position, times(this.axes[i], step));
-    });
-  }
+  /// Moves right and down, by parts of the distance.
+  pan(x, y) { this.move(x * this.distance, y * this.distance); }
 
   /// Moves towards the target so that its distance is multiplied by a factor.
   dolly(factor) {

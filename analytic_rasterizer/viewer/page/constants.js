@@ -36,7 +36,6 @@ export const HALF_NODES = {
   ],
 };
 
-/// The nodes of a pixel with fixed samples [px].
 export function nodesOf(samples) {
   if (samples === 1) return [[0, 0]];
   const half = HALF_NODES[samples];

@@ -1,9 +1,9 @@
 // WGSL of the footprints, from the headers of csrc/core/footprint. A header names its formula, a key of KINDS, by kPage.
 
-import { MINIMAX, cellsOf, nodesOf, shaderNumber } from './constants.js';
+import { cellsOf, nodesOf, shaderNumber } from './constants.js';
+import { COMPENSATED, WINDOW, WINDOW_SHAPE, gaussianShape, wgslOf } from './formulas.js';
 
-/// What passes need to know of an entry of `footprints` of the scene (viewer/packing.py). `reach` is the largest
-/// |coordinate| of a node [px].
+/// Of an entry of `footprints` of the scene (viewer/packing.py). `reach`: the largest |coordinate| of a node [px].
 export function sampling({ kind, samples }) {
   const moves = kind === 'moving', nodes = moves ? cellsOf(samples) : nodesOf(samples);
   return { nodes, moves, side: Math.sqrt(samples), reach: moves ? 0.5 : Math.max(...nodes.flat().map(Math.abs)) };
@@ -15,18 +15,15 @@ const WHITENED = `
 fn whitened(w: vec3f, p: vec2f) -> vec2f { return vec2f(w.x * p.x, fma(w.y, p.x, w.z * p.y)); }
 `;
 
-/// s = w.xx, w.yx, w.yy, 0, 0 of the whitening matrix; peak = log2(opacity amp). `amplitude` uses det and blurredDet.
-const gaussianShape = amplitude => `
-  let v = frame.variance; let blurredX = xx + v; let blurredDet = det + v * (xx + yy) + v * v;
-  let across = sqrt(blurredX / blurredDet); let amp = ${amplitude};
-  s.a = vec4f(centre, 1.0 / sqrt(blurredX), -across * (xy / blurredX));
-  s.b = vec4f(across, 0.0, 0.0, log2(opacity * amp));
-  var level = 2.0 * log(opacity * amp / kAlphaMin);
-  let largest = max(s.a.z, max(abs(s.a.w), across));`;
+/// s = w.xx, w.yx, w.yy, 0, 0.
+const gaussian = amplitude => `${wgslOf(gaussianShape(amplitude))}
+  s.a = vec4f(centre, w.xy);
+  s.b = vec4f(w.z, 0.0, 0.0, peak);
+  let largest = max(w.x, max(abs(w.y), w.z));`;
 
 const GAUSSIAN = {
   functions: WHITENED,
-  shape: gaussianShape('sqrt(det / blurredDet)'),
+  shape: gaussian(COMPENSATED),
   ellipse: 'return support(s.a.xy, s.a.zw, vec2f(0.0, s.b.x), s.a.z * s.b.x, s.c.w, reach);',
   slots: 2,
   terms: `
@@ -62,31 +59,13 @@ fn cumulantPart(p: f32, a: vec4f) -> f32 {
 }
 `;
 
-const WINDOW = `
-struct Axis { half: f32, constant: f32, square: f32 }
-fn axisAt(r: f32) -> Axis { return Axis(0.5 * r, r * (kLogistic1 + 0.25 * kLogistic3 * r * r), 3.0 * kLogistic3 * r); }
-fn logistic2(z: f32) -> f32 { return z * fma(kLogistic3 * kLog2e * z, z, kLogistic1 * kLog2e); }
-fn oneMinusExp(x: f32, e: f32) -> f32 {  // 1 - exp(-x), of which e = exp(-x)
-  let series = ${MINIMAX.map(shaderNumber).reduceRight((sum, c) => `fma(${sum}, x, ${c})`)};
-  return select(1.0 - e, x * series, x < 0.5);
-}
-struct Window { numerator: f32, denominator: f32 }
-fn window(t: f32, a: Axis) -> Window {
-  let distance = abs(t);
-  let lower = exp2(min(logistic2(distance - a.half), 40.0 * kLog2e));
-  let upper = exp2(max(-logistic2(distance + a.half), -126.0));  // what is smaller is no normal number
-  return Window(oneMinusExp(fma(a.square * t, t, a.constant), lower * upper), (1.0 + lower) * (1.0 + upper));
-}
-fn widened(r: f32) -> f32 { return r / sqrt(1.0 + kPixelVariance * r * r); }
-`;
-
 export const KINDS = {
-  gaussian: { ...GAUSSIAN, shape: gaussianShape('1.0') },
+  gaussian: { ...GAUSSIAN, shape: gaussian('1.0') },
   compensated: GAUSSIAN,
   moving: GAUSSIAN,
   cumulants: {
     functions: WHITENED + CUMULANTS,
-    shape: `${gaussianShape('sqrt(det / blurredDet)')}
+    shape: `${gaussian(COMPENSATED)}
   let conic = vec2f(dot(s.a.zw, s.a.zw), s.b.x * s.b.x);
   level += dot(conic, conic) / 124.0;`,
     ellipse: GAUSSIAN.ellipse,
@@ -106,28 +85,13 @@ export const KINDS = {
       let raw = exp2(gaussian - cumulantPart(across.y, slot3[k]) - cumulantPart(across.x, slot2[k]));${inner}`,
   },
   window: {
-    functions: WINDOW,
+    functions: wgslOf(WINDOW),
     // s = 1/s1, 1/s2, (cos, sin) of the wide axis, 0; peak = opacity 2 pi s1 s2.
-    shape: `
-  let dx = xx - yy; let dy = 2.0 * xy; let gap = sqrt(dx * dx + dy * dy); let major = 0.5 * (xx + yy + gap);
-  var axis = vec2f(1.0, 0.0);
-  if (dx > 0.0) {
-    axis.x = sqrt(0.5 * (1.0 + dx / gap));
-    axis.y = dy / (2.0 * gap * axis.x);
-  } else if (gap > 0.0) {
-    let sine = sqrt(0.5 * (1.0 - dx / gap));
-    axis = vec2f(abs(dy) / (2.0 * gap * sine), select(sine, -sine, dy < 0.0));
-  }
-  let s1 = max(sqrt(major), kMinSigma); let s2 = max(sqrt(max(det / major, 0.0)), kMinSigma);
-  let mass = opacity * (2.0 * kPi) * s1 * s2;
-  s.a = vec4f(centre, 1.0 / s1, 1.0 / s2);
-  s.b = vec4f(axis, 0.0, mass);
-  let wu = widened(s.a.z); let wv = widened(s.a.w);
-  let fu = window(0.0, axisAt(s.a.z)); let fv = window(0.0, axisAt(s.a.w));
-  let top = mass * (fu.numerator * fv.numerator) / (fu.denominator * fv.denominator);
-  let level = 2.0 * log(top / kAlphaMin) + (wu * wu * wu * wu + wv * wv * wv * wv) / 48.0 + 0.1;
-  let largest = max(wu, wv);`,
-    ellipse: `let r = vec2f(widened(s.a.z), widened(s.a.w));
+    shape: `${wgslOf(WINDOW_SHAPE)}
+  s.a = vec4f(centre, inverse);
+  s.b = vec4f(axis, 0.0, peak);
+  let largest = sqrt(max(conic.x, conic.y));`,
+    ellipse: `let r = s.a.zw / sqrt(1.0 + kPixelVariance * s.a.zw * s.a.zw);
   return support(s.a.xy, vec2f(r.x * s.b.x, -r.y * s.b.y), vec2f(r.x * s.b.y, r.y * s.b.x), r.x * r.y, s.c.w, reach);`,
     slots: 3,
     terms: `
@@ -138,9 +102,9 @@ export const KINDS = {
     pixel: `
       let m = slot0[k]; let o = slot1[k];`,
     alpha: (_, inner) => `
-      let fu = window(fma(m.x, p.x, fma(m.y, p.y, o.x)), axisAt(o.z));
-      let fv = window(fma(m.z, p.x, fma(m.w, p.y, o.y)), axisAt(o.w));
-      let raw = slot2[k].x * (fu.numerator * fv.numerator) * (1.0 / (fu.denominator * fv.denominator));${inner}`,
+      let fu = window(fma(m.x, p.x, fma(m.y, p.y, o.x)), o.z);
+      let fv = window(fma(m.z, p.x, fma(m.w, p.y, o.y)), o.w);
+      let raw = slot2[k].x * (fu.x * fv.x) * (1.0 / (fu.y * fv.y));${inner}`,
   },
 };
 

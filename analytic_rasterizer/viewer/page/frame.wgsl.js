@@ -12,7 +12,7 @@ export const FRAME_BYTES = 144;
 export const FRAME = `
 ${Object.entries(CONSTANTS).map(([name, value]) => `const ${name} = ${shaderNumber(value)};`).join('\n')}
 struct Frame {
-  viewX: vec4f, viewY: vec4f, viewZ: vec4f,  // rows of world to camera
+  view: array<vec4f, 3>,                     // rows of world to camera
   eye: vec4f,
   pinhole: vec4f,                            // focal lengths and principal point [px]
   limit: vec2f,                              // of |x/z| and |y/z| in the Jacobian

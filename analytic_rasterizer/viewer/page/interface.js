@@ -139,12 +139,12 @@ export class Interface {
       if (others.length > 0) {
         const before = Math.hypot(old.x - others[0].x, old.y - others[0].y);
         const after = Math.hypot(now.x - others[0].x, now.y - others[0].y);
-        viewer.dolly(Math.max(before, 1) / Math.max(after, 1));
+        viewer.steer('dolly', Math.max(before, 1) / Math.max(after, 1));
         viewer.pan(x / 2, y / 2);
       } else if (event.shiftKey || (event.buttons & 6) !== 0) {
         viewer.pan(x, y);
       } else {
-        viewer.orbit(x * RADIANS_PER_PX, y * RADIANS_PER_PX);
+        viewer.steer('orbit', x * RADIANS_PER_PX, y * RADIANS_PER_PX);
       }
     });
     surface.addEventListener('contextmenu', event => event.preventDefault());
@@ -152,7 +152,7 @@ export class Interface {
     surface.addEventListener('wheel', event => {
       event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 18 : 1);
-      viewer.dolly(Math.exp(Math.min(Math.max(pixels * WHEEL_STEP, -1), 1)));
+      viewer.steer('dolly', Math.exp(Math.min(Math.max(pixels * WHEEL_STEP, -1), 1)));
     }, { passive: false });
   }
 
@@ -172,7 +172,7 @@ export class Interface {
     window.addEventListener('blur', () => this.keys.clear());
   }
 
-  /// Does what a key stands for. Whether it stands for anything.
+  /// Does what a key stands for, if anything: true.
   press(event) {
     const { viewer } = this, key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     this.faster = event.shiftKey;
@@ -184,8 +184,8 @@ export class Interface {
     if (key in ARROWS) {
       if (event.target === element('divider')) return false;
       const [x, y] = ARROWS[key].map(value => value * ARROW_STEP);
-      if (event.shiftKey) viewer.panBy(x, y);
-      else viewer.orbit(-x, -y);
+      if (event.shiftKey) viewer.steer('pan', x, y);
+      else viewer.steer('orbit', -x, -y);
       return true;
     }
     if (/^[0-9]$/.test(key)) {
@@ -197,13 +197,12 @@ export class Interface {
     return key in this.actions;
   }
 
-  /// What keys and buttons do.
   actionsOf(viewer) {
     const { state, meta } = viewer, after = (list, now) => list[(list.indexOf(now) + 1) % list.length];
     return {
-      '+': () => viewer.dolly(0.9),
-      '=': () => viewer.dolly(0.9),
-      '-': () => viewer.dolly(1 / 0.9),
+      '+': () => viewer.steer('dolly', 0.9),
+      '=': () => viewer.steer('dolly', 0.9),
+      '-': () => viewer.steer('dolly', 1 / 0.9),
       ',': () => viewer.stepView(-1),
       '.': () => viewer.stepView(1),
       c: () => {
@@ -259,7 +258,6 @@ export class Interface {
     element('fold').textContent = folded ? 'Show' : 'Hide';
   }
 
-  /// Brings all controls in line with the state of the viewer.
   update() {
     const { footprint, compare, mode, divisor, divider } = this.viewer.state;
     const isPhotograph = compare === PHOTOGRAPH, { besidePhotograph } = this.viewer;
@@ -300,12 +298,12 @@ export class Interface {
     return drawn === wanted ? name : `${name}, drawn as ${drawn}`;
   }
 
-  /// Shows what was drawn, the names of footprints, with size and times of a frame. `rate` is null where the camera
-  /// rests; `stages` are milliseconds by name.
+  /// Names of footprints, size and times of a frame. `rate` is null at rest; `stages` are milliseconds by name.
   showFigures(drawn, width, height, milliseconds, rate, stages) {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
-    element('figures').textContent = `${drawn.join(' | ')}, ${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
+    const time = `${milliseconds.toFixed(1)} ms per frame`;
+    element('figures').textContent = `${drawn.join(' | ')}, ${width} x ${height}, ${speed}${time}`;
   }
 }

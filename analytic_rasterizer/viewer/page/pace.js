@@ -13,7 +13,6 @@ export class Pace {
     for (let time = settled / SAMPLES; time > SLOW && this.divisor < SMALLEST; time /= 4) this.divisor *= 2;
   }
 
-  /// Takes note of what a picture took at the divisor.
   note(milliseconds) {
     const { divisor, times } = this, old = times.get(divisor) ?? milliseconds;
     const now = 0.5 * (old + milliseconds), next = 2 * divisor, last = divisor / 2;

@@ -3,8 +3,9 @@
 import { support } from './bin.wgsl.js';
 import { shaderNumber } from './constants.js';
 import { KINDS } from './footprint.wgsl.js';
+import { PROJECTION, wgslOf } from './formulas.js';
 import { FRAME, WORKGROUP, bindings } from './frame.wgsl.js';
-import { addHarmonics, sceneBytes } from './sh.js';
+import { harmonicsColor, sceneBytes } from './sh.js';
 
 // A Gaussian as the page gets it: `read` for its geometry, `number` for its harmonics.
 const PLAIN = {
@@ -42,10 +43,7 @@ function colorOf(meta, { word, number }) {
 fn colorOf(i: u32, direction: vec3f) -> vec3f {
   let at = i * ${words}u;
   ${Array.from({ length: words }, (_, k) => `let t${k} = ${word(k)};`).join('\n  ')}
-  let x = direction.x; let y = direction.y; let z = direction.z; let xx = x * x; let yy = y * y; let zz = z * z;
-  var color = vec3f(0.5);
-  ${addHarmonics(degree, number, 'vec3f')}
-  return max(color, vec3f(0.0));
+  ${wgslOf(harmonicsColor(degree, number))}
 }`;
 }
 
@@ -71,22 +69,10 @@ fn main(@builtin(global_invocation_id) id: vec3u, @builtin(num_workgroups) group
   keys[i] = 0xffffffffu;
   tiles[i] = 0u;
   let g = gaussianOf(i); let mean = g.mean; let opacity = g.opacity; let scale = g.scale; let q = g.q;
-  let view = vec3f(row(frame.viewX, mean), row(frame.viewY, mean), row(frame.viewZ, mean));
+  let view = vec3f(row(frame.view[0], mean), row(frame.view[1], mean), row(frame.view[2], mean));
   if (!(view.z > kNear)) { return; }
   if (!(within(scale.x, kMaxScale) && within(scale.y, kMaxScale) && within(scale.z, kMaxScale))) { return; }
-  let ratio = view.xy / view.z;
-  let centre = frame.pinhole.xy * ratio + frame.pinhole.zw - 0.5;
-  let held = clamp(ratio, -frame.limit, frame.limit);
-  let jx = frame.pinhole.x / view.z * (frame.viewX.xyz - held.x * frame.viewZ.xyz);
-  let jy = frame.pinhole.y / view.z * (frame.viewY.xyz - held.y * frame.viewZ.xyz);
-  let r0 = vec3f(1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z - q.x * q.w), 2.0 * (q.y * q.w + q.x * q.z));
-  let r1 = vec3f(2.0 * (q.y * q.z + q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w - q.x * q.y));
-  let r2 = vec3f(2.0 * (q.y * q.w - q.x * q.z), 2.0 * (q.z * q.w + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
-  let vx = (jx.x * r0 + jx.y * r1 + jx.z * r2) * scale;
-  let vy = (jy.x * r0 + jy.y * r1 + jy.z * r2) * scale;
-  // The determinant is never xx yy - xy xy, which is negative for half of all long needles.
-  let normal = cross(vx, vy);
-  let xx = dot(vx, vx); let xy = dot(vx, vy); let yy = dot(vy, vy); let det = dot(normal, normal);
+${wgslOf(PROJECTION)}
   if (!(det >= 0.0 && det < kMaxDet && within(xx, 1e18) && within(yy, 1e18) && opacity <= kMaxOpacity)) { return; }
   var s: Splat;
 ${KINDS[kind].shape}

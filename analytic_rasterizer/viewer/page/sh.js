@@ -1,4 +1,4 @@
-// Spherical harmonics, csrc/core/sh.h, as text of GLSL and WGSL. (x, y, z) is the direction; xx, yy, zz are squares.
+// Spherical harmonics, csrc/core/sh.h, as text of a shader. (x, y, z) is the direction; xx, yy, zz are squares.
 
 const BASIS = [
   '0.28209479177387814',
@@ -11,11 +11,15 @@ const BASIS = [
   '-0.5900435899266435 * x * (xx - 3.0 * yy)',
 ];
 
-/// Statements that add the harmonics up to a degree to `color`. `number(k)` is text for number k, `vector` a type.
-export function addHarmonics(degree, number, vector) {
-  return BASIS.slice(0, (degree + 1) ** 2).map((basis, k) =>
-    `color += (${basis}) * ${vector}(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`).join('\n  ');
-}
+/// GLSL that returns the colour seen in a `direction`, of harmonics up to a degree. `number(k)` is text for number k.
+export const harmonicsColor = (degree, number) => `
+  float x = direction.x; float y = direction.y; float z = direction.z;
+  float xx = x * x; float yy = y * y; float zz = z * z;
+  vec3 color;
+  color = vec3(0.5);
+  ${BASIS.slice(0, (degree + 1) ** 2).map((basis, k) =>
+    `color += (${basis}) * vec3(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`).join('\n  ')}
+  return max(color, vec3(0.0));`;
 
 /// Numbers that the harmonics of a Gaussian take: a multiple of four.
 export const harmonicNumbers = degree => 4 * Math.ceil((3 * (degree + 1) ** 2) / 4);

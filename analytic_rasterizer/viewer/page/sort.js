@@ -1,6 +1,5 @@
-// A worker that orders Gaussians by depth. First message: {geometry, count} of the scene. Then {row, near}: the row of
-// the world-to-camera matrix that gives the depth. Answer: {order}, indices of what lies beyond `near`, the farthest
-// first. Equal depths keep the rasterizer's order, in which the first Gaussian of the input is in front.
+// A worker that orders Gaussians by depth. Messages: {geometry, count}; then {row, near}, the row of the world-to-camera
+// matrix for the depth. Answer: {order}, indices of what is beyond `near`, the farthest first, of equals the last.
 'use strict';
 
 const STRIDE = 12;  // numbers of a Gaussian in geometry

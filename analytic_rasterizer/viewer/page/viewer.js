@@ -52,17 +52,12 @@ export class Viewer {
     else if (what.includes('shaders')) announce(done < of ? what : '');
   }
 
-  /// Takes the scene, which loadScene returned.
   async load(scene) {
     const { renderer } = this;
     this.scene = scene;
-    try {
-      await renderer.load(scene);
-    } catch (error) {
-      await this.replace(renderer, error);
-      return;
-    }
-    renderer.lost.then(() => this.replace(renderer)).catch(() => {});  // which has said why
+    await renderer.load(scene).then(() => {
+      renderer.lost.then(() => this.replace(renderer)).catch(() => {});  // which has said why
+    }, error => this.replace(renderer, error));
   }
 
   /// Another renderer in place of one whose device was lost: the same once, then WebGL 2; or of WebGPU that failed.
@@ -97,7 +92,6 @@ export class Viewer {
     this.wake();
   }
 
-  /// Starts to draw for the user.
   interact() {
     readAddress(this);
     this.controls = new Interface(this);
@@ -111,8 +105,6 @@ export class Viewer {
     this.wake();
   }
 
-  // ------------------------------------------------------------------ what the user asks for
-
   change(part) {
     Object.assign(this.state, part);
     this.controls.update();
@@ -120,25 +112,16 @@ export class Viewer {
     this.restLater();
   }
 
-  orbit(right, down) {
-    this.camera.orbit(right, down);
+  /// Has the camera orbit, pan or dolly.
+  steer(how, ...by) {
+    this.camera[how](...by);
     this.moved();
   }
 
+  /// By px of the page.
   pan(x, y) {
     const { fx, fy } = this.pinhole(), ratio = window.devicePixelRatio || 1;
-    this.panBy((-x * ratio) / fx, (-y * ratio) / fy);
-  }
-
-  /// By parts of the distance.
-  panBy(x, y) {
-    this.camera.move(x * this.camera.distance, y * this.camera.distance, 0);
-    this.moved();
-  }
-
-  dolly(factor) {
-    this.camera.dolly(factor);
-    this.moved();
+    this.steer('pan', (-x * ratio) / fx, (-y * ratio) / fy);
   }
 
   focusOn(x, y) {
@@ -186,7 +169,6 @@ export class Viewer {
     });
   }
 
-  /// An entry of the footprints. Throws for an unknown name.
   footprint(name) { return parseFootprint(name, this.meta.footprints); }
 
   /// What is drawn for this name: a quicker footprint while the camera moves, and where the renderer cannot draw it.
@@ -194,8 +176,6 @@ export class Viewer {
     const wanted = this.footprint(name);
     return moving || !this.renderer.draws(wanted) ? this.footprint(wanted.instead ?? wanted.name) : wanted;
   }
-
-  // ------------------------------------------------------------------ the loop
 
   /// Has a frame drawn soon.
   wake() {
@@ -332,7 +312,6 @@ export class Viewer {
     return this.paces.get(key);
   }
 
-  /// Shows what was drawn last.
   present() {
     const { mode, divider, background } = this.state, { left, right } = this.shown, { canvas } = this.renderer;
     const [width, height] = this.size;

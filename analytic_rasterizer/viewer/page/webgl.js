@@ -149,7 +149,6 @@ export class WebGLRenderer {
     if (this.isLost || this.gl.isContextLost()) throw new Error('The graphics device was lost.');
   }
 
-  /// Takes indices of Gaussians, the farthest first.
   setOrder(order) {
     fillTexture(this.gl, this.order, SPLATS_PER_ROW, this.orderFormat, 1, order);
     this.visible = order.length;
@@ -163,12 +162,12 @@ export class WebGLRenderer {
       framebuffer: this.projected, width: SPLATS_PER_ROW, height: this.rows,
       textures: { uGeometry: this.geometry, uHarmonics: this.harmonics },
       uniforms: {
-        uView: w2c.slice(0, 12), uEye: eye, uPinhole: [fx, fy, cx, cy], uLimit: limits, uVariance: [variance],
+        'frame.view': w2c.slice(0, 12), 'frame.eye': eye, 'frame.pinhole': [fx, fy, cx, cy], 'frame.limit': limits,
+        'frame.variance': [variance],
       },
     });
   }
 
-  /// Blends the splats of the last projection into a picture, back to front.
   blend(picture, { kind }, columns) {
     const program = this.program(`blend ${kind}`, () => drawVertexShader(kind), () => drawFragmentShader(kind));
     const [uMean, uWhitening, uColor] = this.splats;

@@ -1,9 +1,11 @@
 // GLSL of the passes project, blend and present, after csrc/core. Everything is highp: 16 bits are too few. Offsets are
 // floor(gl_FragCoord) - mean, not interpolated, which is exact. Forms stay positive however a compiler rounds them.
 
-import { CONSTANTS, MINIMAX, shaderNumber } from './constants.js';
-import { heatMap } from './present.wgsl.js';
-import { addHarmonics, harmonicNumbers } from './sh.js';
+import { CONSTANTS, shaderNumber } from './constants.js';
+import {
+  COMPENSATED, GL_FUNCTIONS, HEAT_MAP, PROJECTION, WINDOW, WINDOW_SHAPE, gaussianShape,
+} from './formulas.js';
+import { harmonicNumbers, harmonicsColor } from './sh.js';
 
 // Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
 export const SPLATS_PER_INSTANCE = 4096;
@@ -16,23 +18,7 @@ precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
 ${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${shaderNumber(value)};`).join('\n')}
-`;
-
-// F(t) of docs/internals/numerics.md, "Logistic window", as numerator and denominator. `r` = 1/sigma [1/px].
-const GL_WINDOW = `
-float logistic2(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }
-float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
-  float series = ${MINIMAX.map(shaderNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
-  return x < 0.5 ? x * series : 1.0 - e;
-}
-vec2 window(float t, float r) {
-  float h = 0.5 * r, distance = abs(t);
-  float lower = exp2(min(logistic2(distance - h), 40.0 * kLog2e));
-  float upper = exp2(max(-logistic2(distance + h), -126.0));  // what is smaller is no normal number
-  float y = 3.0 * kLogistic3 * r * t * t + r * (kLogistic1 + kLogistic3 * h * h);
-  return vec2(oneMinusExp(y, lower * upper), (1.0 + lower) * (1.0 + upper));
-}
-`;
+${GL_FUNCTIONS}`;
 
 /// GLSL of the colour from spherical harmonics. Coefficients are packed four numbers to a texel.
 function harmonics(degree) {
@@ -40,11 +26,7 @@ function harmonics(degree) {
   const read = Array.from({ length: texels }, (_, k) => `vec4 t${k} = texelFetch(uHarmonics, at + ivec2(${k}, 0), 0);`);
   return `
 vec3 colorSeenFrom(vec3 direction, ivec2 at) {
-  vec3 color = vec3(0.5);
-  ${read.join('\n  ')}
-  float x = direction.x, y = direction.y, z = direction.z, xx = x * x, yy = y * y, zz = z * z;
-  ${addHarmonics(degree, number, 'vec3')}
-  return max(color, 0.0);
+  ${read.join('\n  ')}${harmonicsColor(degree, number)}
 }
 `;
 }
@@ -59,78 +41,38 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 /// Projects one Gaussian per fragment. Written for each: mean, root of the level and peak; whitening matrix; colour.
 /// A root of zero marks what is not drawn.
 export function projectShader(kind, degree) {
-  const gaussian = `
-  float blurredX = xx + uVariance, blurredDet = det + uVariance * (xx + yy) + uVariance * uVariance;
-  float across = sqrt(blurredX / blurredDet), slope = -across * (xy / blurredX);
-  whitening = vec4(inversesqrt(blurredX), 0.0, slope, across);
-  float amplitude = ${kind === 'gaussian' ? '1.0' : 'sqrt(det / blurredDet)'};
-  peak = log2(opacity * amplitude);
-  level = 2.0 * log(opacity * amplitude / kAlphaMin);`;
-  const turned = `
-  float dx = xx - yy, dy = 2.0 * xy, gap = length(vec2(dx, dy)), major = 0.5 * (xx + yy + gap);
-  float s1 = max(sqrt(major), kMinSigma), s2 = max(sqrt(det / max(major, 1e-30)), kMinSigma);
-  vec2 axis = vec2(1.0, 0.0);
-  if (dx > 0.0) {
-    axis.x = sqrt(0.5 * (1.0 + dx / gap));
-    axis.y = dy / (2.0 * gap * axis.x);
-  } else if (gap > 0.0) {
-    float sine = sqrt(0.5 * (1.0 - dx / gap));
-    axis = vec2(abs(dy) / (2.0 * gap * sine), dy < 0.0 ? -sine : sine);
-  }
-  vec2 inverse = 1.0 / vec2(s1, s2);
-  whitening = vec4(axis * inverse.x, vec2(-axis.y, axis.x) * inverse.y);
-  peak = opacity * (2.0 * kPi) * s1 * s2;
-  vec2 top = window(0.0, inverse.x) * window(0.0, inverse.y);
-  vec2 widened = inverse * inverse / (1.0 + kPixelVariance * inverse * inverse);
-  level = 2.0 * log(peak * top.x / top.y / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
+  const shape = kind === 'window' ? `${WINDOW_SHAPE}
+  vec4 whitening = vec4(axis * inverse.x, vec2(-axis.y, axis.x) * inverse.y);`
+    : `${gaussianShape(kind === 'gaussian' ? '1.0' : COMPENSATED)}
+  vec4 whitening = vec4(w.x, 0.0, w.yz);`;
   return `${HEAD}
 uniform sampler2D uGeometry, uHarmonics;
-uniform vec4 uView[3];  // rows of world to camera
-uniform vec3 uEye;
-uniform vec4 uPinhole;  // focal lengths and principal point [px]
-uniform vec2 uLimit;    // of |x/z| and |y/z| in the Jacobian
-uniform float uVariance;
+uniform struct Frame { vec4 view[3], pinhole; vec3 eye; vec2 limit; float variance; } frame;  // of frame.wgsl.js
 layout(location = 0) out uvec4 outMean;
 layout(location = 1) out uvec4 outWhitening;
 layout(location = 2) out uvec4 outColor;
-${kind === 'window' ? GL_WINDOW : ''}${harmonics(degree)}
+${kind === 'window' ? WINDOW : ''}${harmonics(degree)}
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
   outMean = outWhitening = outColor = uvec4(0);
   ivec2 texel = ivec2(3 * pixel.x, pixel.y);
-  vec4 g0 = texelFetch(uGeometry, texel, 0), g1 = texelFetch(uGeometry, texel + ivec2(1, 0), 0);
-  vec4 q = texelFetch(uGeometry, texel + ivec2(2, 0), 0);
-  vec3 position = g0.xyz, scale = g1.xyz;
+  vec4 g0 = texelFetch(uGeometry, texel, 0), q = texelFetch(uGeometry, texel + ivec2(2, 0), 0);
+  vec3 scale = texelFetch(uGeometry, texel + ivec2(1, 0), 0).xyz;
   float opacity = g0.w;
-
-  vec3 v = vec3(dot(uView[0].xyz, position) + uView[0].w, dot(uView[1].xyz, position) + uView[1].w,
-                dot(uView[2].xyz, position) + uView[2].w);
-  if (!(v.z > kNear)) return;
-  float inverseZ = 1.0 / v.z;
-  vec2 mean = uPinhole.xy * v.xy * inverseZ + uPinhole.zw - 0.5;
-  if (!(abs(mean.x) < 1e9 && abs(mean.y) < 1e9)) return;
-  vec2 ratio = clamp(v.xy * inverseZ, -uLimit, uLimit);
-  vec3 ax = uPinhole.x * inverseZ * (uView[0].xyz - ratio.x * uView[2].xyz);
-  vec3 ay = uPinhole.y * inverseZ * (uView[1].xyz - ratio.y * uView[2].xyz);
-  float w = q.x, a = q.y, b = q.z, c = q.w;
-  mat3 turn = mat3(1.0 - 2.0 * (b * b + c * c), 2.0 * (a * b - w * c), 2.0 * (a * c + w * b),
-                   2.0 * (a * b + w * c), 1.0 - 2.0 * (a * a + c * c), 2.0 * (b * c - w * a),
-                   2.0 * (a * c - w * b), 2.0 * (b * c + w * a), 1.0 - 2.0 * (a * a + b * b));
-  vec3 rowX = (turn * ax) * scale, rowY = (turn * ay) * scale, normal = cross(rowX, rowY);
-  // The determinant is never xx yy - xy xy, which is negative for half of all long needles.
-  float xx = dot(rowX, rowX), xy = dot(rowX, rowY), yy = dot(rowY, rowY), det = dot(normal, normal);
-  if (!(det < kMaxDet && xx < 1e18 && yy < 1e18)) return;
-  vec4 whitening;
-  float peak, level;
-${kind === 'window' ? turned : gaussian}
+  vec4 mean = vec4(g0.xyz, 1.0);
+  vec3 view = vec3(dot(frame.view[0], mean), dot(frame.view[1], mean), dot(frame.view[2], mean));
+  if (!(view.z > kNear)) return;
+${PROJECTION}
+  if (!(abs(centre.x) < 1e9 && abs(centre.y) < 1e9 && det < kMaxDet && xx < 1e18 && yy < 1e18)) return;
+${shape}
   if (!(level > 0.0 && level < 1e6)) return;
 
   int texels = ${texelsOfHarmonics(degree)}, perRow = textureSize(uHarmonics, 0).x / texels;
   ivec2 at = ivec2(i % perRow * texels, i / perRow);
-  outMean = floatBitsToUint(vec4(mean, sqrt(level + kLevelSlack), peak));
+  outMean = floatBitsToUint(vec4(centre, sqrt(level + kLevelSlack), peak));
   outWhitening = floatBitsToUint(whitening);
-  outColor = floatBitsToUint(vec4(colorSeenFrom(normalize(position - uEye), at), 0.0));
+  outColor = floatBitsToUint(vec4(colorSeenFrom(normalize(mean.xyz - frame.eye), at), 0.0));
 }
 `;
 }
@@ -145,7 +87,7 @@ float alphaAt(vec2 d) {
 export const GL_KINDS = {
   gaussian: GL_GAUSSIAN,
   compensated: GL_GAUSSIAN,
-  window: `${GL_WINDOW}
+  window: `${WINDOW}
 float alphaAt(vec2 d) {
   vec2 u = window(dot(fW.xy, d), fR.x), v = window(dot(fW.zw, d), fR.y);
   return fPeak * (u.x * v.x) / (u.y * v.y);
@@ -192,7 +134,6 @@ void main() {
 `;
 }
 
-/// Writes premultiplied colour and alpha.
 export const drawFragmentShader = kind => `${HEAD}
 ${varyings('in')}
 out vec4 color;
@@ -214,12 +155,7 @@ uniform float uDivider;  // canvas px; right of it is uRight
 uniform bool uDifference;
 out vec4 color;
 vec3 over(vec4 c) { return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0); }
-vec3 heat(float difference) {
-  vec3 color;
-  ${heatMap('vec3')}
-  return color;
-}
-void main() {
+${HEAT_MAP}void main() {
   vec2 at = vec2(gl_FragCoord.x, uCanvas.y - gl_FragCoord.y);
   ivec2 texel = min(ivec2(at / uCanvas * uSize), ivec2(uSize) - 1);
   vec4 a = texelFetch(uLeft, texel, 0), b = texelFetch(uRight, texel, 0);

@@ -42,7 +42,6 @@ export function fillTexture(gl, texture, width, format, numbersPerTexel, data) {
   }
 }
 
-/// A framebuffer that draws into these textures, which have one size.
 export function createFramebuffer(gl, textures) {
   const framebuffer = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
@@ -52,8 +51,7 @@ export function createFramebuffer(gl, textures) {
   return framebuffer;
 }
 
-/// Draws a triangle or quads into `columns` of a framebuffer, or of the canvas for null. `textures` and `uniforms` are by
-/// their names in the shaders; a uniform is a list of floats, or a flat one of vectors of four.
+/// Draws a triangle or quads into `columns` of a framebuffer, or of the canvas for null. Uniforms are lists of floats.
 export function runProgram(gl, { program, places }, target) {
   const { framebuffer, width, height, columns = [0, width], blends = false, textures, uniforms, quads } = target;
   const placeOf = name => places[name] ??= gl.getUniformLocation(program, name);

@@ -31,8 +31,7 @@ class Pipelines {
     this.groups = new Map();
   }
 
-  /// Compiles what these steps need, and calls `note` with how many shaders are done and how many there are. Rejects
-  /// with the compiler's message.
+  /// Compiles what these steps need. Calls `note` with how many shaders are done and how many there are.
   async prepare(steps, note = () => {}) {
     const missing = new Map(steps.filter(({ key }) => !this.made.has(key)).map(step => [step.key, step]));
     let done = 0;
@@ -82,7 +81,7 @@ export class Passes {
     this.counts = this.buffer(16, new Uint32Array([n, 0, 0, 0]));
     this.arguments = this.buffer(48, null, GPUBufferUsage.INDIRECT);
     this.totals = this.buffer(64);
-    this.frame = this.uniform(FRAME_BYTES);
+    this.frame = this.buffer(FRAME_BYTES, null, GPUBufferUsage.UNIFORM);
     if (device.features.has('timestamp-query')) {
       this.queries = device.createQuerySet({ type: 'timestamp', count: 2 * STAGES.length });
       this.stamps = this.buffer(16 * STAGES.length, null, GPUBufferUsage.QUERY_RESOLVE);
@@ -98,23 +97,15 @@ export class Passes {
     return buffer;
   }
 
-  uniform(size) {
-    const { UNIFORM, COPY_DST } = GPUBufferUsage;
-    return this.device.createBuffer({ size, label: `${++this.numbered}`, usage: UNIFORM | COPY_DST });
-  }
-
   /// A uniform of four whole numbers that never change.
   constant(...words) {
     const key = words.join();
     if (!this.uniforms.has(key)) {
-      const buffer = this.uniform(16);
-      this.device.queue.writeBuffer(buffer, 0, new Uint32Array(words));
-      this.uniforms.set(key, buffer);
+      this.uniforms.set(key, this.buffer(16, new Uint32Array(words), GPUBufferUsage.UNIFORM));
     }
     return this.uniforms.get(key);
   }
 
-  /// Pairs that a binding can have.
   get mostPairs() { return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4); }
 
   /// Makes room for so many pairs, or as many as a binding can have, and forgets those that there were.
@@ -178,7 +169,6 @@ export class Passes {
     }
   }
 
-  /// Copies the timestamps into a buffer.
   stamp(encoder, buffer, at) {
     if (!this.queries) return;
     encoder.resolveQuerySet(this.queries, 0, 2 * STAGES.length, this.stamps, 0);
