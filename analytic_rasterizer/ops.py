@@ -7,6 +7,7 @@ from `_C`.
 from __future__ import annotations
 
 import math
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -175,11 +176,6 @@ def _(a):
     return tuple(like.new_empty(count, *rest) for rest in ((4, 4), (4, 4), (3,), (_LENS_WIDTH,)))
 
 
-@_register("prepare_cameras_vjp")
-def _(a):
-    return _gradients(a, "prepare_cameras")
-
-
 @_register("prepare_lens")
 def _(a):
     return a.viewmatrix.new_empty(_LENS_WIDTH)
@@ -267,19 +263,9 @@ def _(a):
     return *made, a.row_splits.new_empty(a.row_splits.shape), saved
 
 
-@_register("repeat_at_seam_vjp")
-def _(a):
-    return _gradients(a, "repeat_at_seam")
-
-
 @_register("count_rows")
 def _(a):
     return a.means3D.new_empty(a.viewmatrix.shape[0], a.means3D.shape[0], dtype=torch.int32)
-
-
-@_register("pack_rows_")
-def _(a):
-    return None
 
 
 @_register("pack_rows_vjp")
@@ -335,16 +321,6 @@ def _(a):
     return _gradients(a, "rasterize")
 
 
-@_register("project_vjp")
-def _(a):
-    return _gradients(a, "project")
-
-
-@_register("blend_vjp")
-def _(a):
-    return _gradients(a, "blend")
-
-
 @_register("inspect")
 def _(a):
     return _summary(a.depths, a.depths.shape[0], a)
@@ -375,25 +351,10 @@ def _(a):
     return a.image.new_empty(()), _partials(a)
 
 
-@_register("ssim_map_vjp")
-def _(a):
-    return _gradients(a, "ssim_map")
-
-
-@_register("l1_ssim_vjp")
-def _(a):
-    return _gradients(a, "l1_ssim")
-
-
 @_register("activate")
 def _(a):
     penalty = a.log_scales.new_empty(() if a.opacity_weight or a.scale_weight else 0)
     return *(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities)), penalty
-
-
-@_register("activate_vjp")
-def _(a):
-    return _gradients(a, "activate")
 
 
 @_register("apply_3d_filter")
@@ -401,19 +362,9 @@ def _(a):
     return a.scales.new_empty(a.scales.shape), a.opacities.new_empty(a.opacities.shape)
 
 
-@_register("apply_3d_filter_vjp")
-def _(a):
-    return _gradients(a, "apply_3d_filter")
-
-
 @_register("correct_colors")
 def _(a):
     return a.image.new_empty(a.image.shape)
-
-
-@_register("correct_colors_vjp")
-def _(a):
-    return _gradients(a, "correct_colors")
 
 
 @_register("picture_gradients")
@@ -432,16 +383,17 @@ def _(a):
     return a.rows.new_empty(()), a.rows.new_empty(a.target.shape), rows
 
 
-@_register("observe_")
-def _(a):
-    return None
-
-
-@_register("add_noise_")
-def _(a):
-    return None
-
-
-@_register("adam_")
-def _(a):
-    return None
+for _name in (
+    "prepare_cameras",
+    "repeat_at_seam",
+    "project",
+    "blend",
+    "ssim_map",
+    "l1_ssim",
+    "activate",
+    "apply_3d_filter",
+    "correct_colors",
+):
+    _register(f"{_name}_vjp")(partial(_gradients, op=_name))
+for _name in ("pack_rows_", "observe_", "add_noise_", "adam_"):  # which only write
+    _register(_name)(lambda a: None)

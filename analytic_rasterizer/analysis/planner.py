@@ -98,53 +98,37 @@ def inspect_scene(
     if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
         raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
     chosen = _choose_effects(scene, cameras, tolerance, training)
-    rms = {footprint: [] for footprint in LADDER}
-    fitting, seen = list(rms), []  # footprints within the tolerance so far; what each view shows
-    shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
-    top_band = 0.0  # what the last band of the harmonics changes
-    for camera in cameras:
-        progress("compare footprints")
-        reference = _stages(scene, camera, REFERENCE, chosen.everything)
-        seen.append(_touching(reference))
-        shown, on_image = shown | seen[-1], on_image | (reference.radii > 0)
-        for footprint in list(fitting):
-            stages = _stages(scene, camera, footprint, chosen.effects)
-            rms[footprint].append(_rms(stages, reference))
-            shown = shown | _touching(stages)
-            if rms[footprint][-1] > tolerance:
-                fitting.remove(footprint)
-        if chosen.effects.sh_degree is None and scene.sh_degree > 0:
-            fewer = replace(chosen.everything, sh_degree=scene.sh_degree - 1)
-            top_band = max(top_band, _rms(_stages(scene, camera, REFERENCE, fewer), reference))
-
+    found = _compare(scene, cameras, chosen, tolerance, progress)
     timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
-    tried = {name: (scene, name, chosen.effects) for name in dict.fromkeys([BASE, *fitting])}
+    tried = {name: (scene, name, chosen.effects) for name in dict.fromkeys([BASE, *found.fitting])}
     progress("time footprints")
     seconds = _seconds(tried, timed, rounds)
-    cheapest = min(seconds[name] for name in fitting)
-    footprint = next(name for name in fitting if seconds[name] <= SAME * cheapest)
+    cheapest = min(seconds[name] for name in found.fitting)
+    footprint = next(name for name in found.fitting if seconds[name] <= SAME * cheapest)
     costs = {name: of_name / seconds[BASE] for name, of_name in seconds.items()}
-    candidates = {name: Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms}
+    candidates = {
+        name: Candidate(name, max(rms), name in found.fitting, costs.get(name)) for name, rms in found.rms.items()
+    }
     reports = []
     for i, camera in enumerate(cameras):
         progress("look at views")
         name = getattr(views[i], "name", f"view_{i:03d}")
-        reports.append(_view_report(scene, chosen, i, name, camera, seen[i], rms[footprint][i]))
+        reports.append(_view_report(scene, chosen, i, name, camera, found.seen[i], found.rms[footprint][i]))
     progress("time effects")
-    costs = _effect_costs(scene, timed, footprint, chosen.effects, shown, rounds)
+    costs = _effect_costs(scene, timed, footprint, chosen.effects, found.shown, rounds)
     orders = _order_difference(scene, cameras, chosen.effects)
     findings = (
         _footprint_finding(candidates, footprint, reports),
-        _sh_finding(scene, chosen, top_band, costs.get("sh")),
+        _sh_finding(scene, chosen, found.top_band, costs.get("sh")),
         _filter_finding(chosen, costs.get("filter_3d")),
-        _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
+        _cull_finding(scene, cameras, found.shown, found.on_image, costs["culls"]),
         _order_finding(orders, tolerance, costs.get("order")),
-        _affine_finding(scene, cameras, seen, [report.name for report in reports]),
+        _affine_finding(scene, cameras, found.seen, [report.name for report in reports]),
         *_other_findings(chosen, costs["outputs"]),
     )
     machine = timing.describe_machine(scene.means.device.type)
-    found = (chosen.effects, footprint, findings, tuple(candidates.values()), tuple(reports), shown)
-    return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *found)
+    choice = (chosen.effects, footprint, findings, tuple(candidates.values()), tuple(reports), found.shown)
+    return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *choice)
 
 
 def steps_of(views: Sequence) -> int:
@@ -216,6 +200,38 @@ def _choose_effects(scene: Gaussians, cameras: list, tolerance: float, training:
         filter_3d=everything.filter_3d if (filter_change or 0) > FILTER_SHARE * tolerance else None,
     )
     return _ChosenEffects(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
+
+
+@dataclass(eq=False)
+class _Comparison:
+    """How the footprints of LADDER render the views, beside REFERENCE with everything switched on."""
+
+    rms: dict[str, list[float]]  # by footprint, of the views up to the first beyond the tolerance
+    fitting: list[str]  # footprints within the tolerance in all views
+    seen: list[torch.Tensor]  # (P,) bool of each view: which Gaussians touch it
+    shown: torch.Tensor  # (P,) bool: those of any view, with any footprint
+    on_image: torch.Tensor  # (P,) bool: those with a radius in any view
+    top_band: float  # RMS that the last band of the harmonics changes
+
+
+def _compare(scene: Gaussians, cameras: list, chosen: _ChosenEffects, tolerance: float, progress) -> _Comparison:
+    nothing = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
+    found = _Comparison({footprint: [] for footprint in LADDER}, list(LADDER), [], nothing, nothing, 0.0)
+    for camera in cameras:
+        progress("compare footprints")
+        reference = _stages(scene, camera, REFERENCE, chosen.everything)
+        found.seen.append(_touching(reference))
+        found.shown, found.on_image = found.shown | found.seen[-1], found.on_image | (reference.radii > 0)
+        for footprint in list(found.fitting):
+            stages = _stages(scene, camera, footprint, chosen.effects)
+            found.rms[footprint].append(_rms(stages, reference))
+            found.shown = found.shown | _touching(stages)
+            if found.rms[footprint][-1] > tolerance:
+                found.fitting.remove(footprint)
+        if chosen.effects.sh_degree is None and scene.sh_degree > 0:
+            fewer = replace(chosen.everything, sh_degree=scene.sh_degree - 1)
+            found.top_band = max(found.top_band, _rms(_stages(scene, camera, REFERENCE, fewer), reference))
+    return found
 
 
 def _prepare(scene: Gaussians, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:

@@ -65,15 +65,7 @@ def camera_settings(
     check_tensors(None, world_to_camera=world_to_camera, **({} if bg is None else {"bg": bg}))
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
-    for name, value in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy)):
-        if isinstance(value, torch.Tensor):  # whose value is not examined: on a device that would have to wait
-            if value.numel() != 1:
-                raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
-        elif name in ("fx", "fy"):
-            if not 0 < one_number(name, value) < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        elif value is not None and not math.isfinite(one_number(name, value)):
-            raise ValueError(f"{name} must be finite, got {value}")
+    _check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
     if lens is not None:
         effects = _with_lens(effects, lens)
     view = world_to_camera.double()
@@ -86,23 +78,13 @@ def camera_settings(
     if isinstance(effects, Effects) and effects.lens is not None and known:
         middle = (width / 2 - cx) / fx, (height / 2 - cy) / fy
         effects = replace(effects, lens=effects.lens.with_reach(tangents, middle, height))
-    zero, one = fx.new_zeros(()), fx.new_ones(())
-    intrinsics = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3).to(view.device)
-    view, projection, position, _ = _prepare(
-        views=view[None],
-        intrinsics=intrinsics,
-        coefficients=None,
-        width=width,
-        height=height,
-        model="orthographic" if orthographic else "pinhole",
-        near=NEAR,
-        far=math.inf,
-    )
+    matrices = _matrices(view, (fx, fy, cx, cy), (width, height), "orthographic" if orthographic else "pinhole")
     # Numbers, unless their gradient may be asked for: reading them later makes the host wait for the device.
     asked_for = isinstance(effects, Effects) and effects.camera_gradients
     if not (asked_for or any(t.requires_grad for t in tangents)):
         tangents = tuple(t.item() for t in tangents)
     to = {"dtype": dtype, "device": view.device if device is None else device}
+    viewmatrix, projmatrix, campos = (matrix.to(**to) for matrix in matrices)
     return GaussianRasterizationSettings(
         image_height=height,
         image_width=width,
@@ -110,15 +92,50 @@ def camera_settings(
         tanfovy=tangents[1],
         bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
         scale_modifier=scale_modifier,
-        viewmatrix=view[0].to(**to),
-        projmatrix=projection[0].to(**to),
+        viewmatrix=viewmatrix,
+        projmatrix=projmatrix,
         sh_degree=sh_degree,
-        campos=position[0].to(**to),
+        campos=campos,
         prefiltered=False,
         debug=debug,
         effects=effects,
         **options,
     )
+
+
+def _check_intrinsics(**numbers: float | torch.Tensor | None) -> None:
+    """Raises TypeError or ValueError for what is no focal length or principal point.
+
+    The value of a tensor is not examined: on a device the host would have to wait.
+    """
+    for name, value in numbers.items():
+        if isinstance(value, torch.Tensor):
+            if value.numel() != 1:
+                raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
+        elif name in ("fx", "fy"):
+            if not 0 < one_number(name, value) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        elif value is not None and not math.isfinite(one_number(name, value)):
+            raise ValueError(f"{name} must be finite, got {value}")
+
+
+def _matrices(
+    view: torch.Tensor, intrinsics: tuple[torch.Tensor, ...], size: tuple[int, int], model: str
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """viewmatrix (4, 4), projmatrix (4, 4) and campos (3,) as the settings have them, float64.
+
+    Args:
+        view: (4, 4) float64, world to camera.
+        intrinsics: fx, fy, cx, cy, each () float64, px.
+        size: (width, height), px.
+        model: "pinhole" or "orthographic".
+    """
+    fx, fy, cx, cy = intrinsics
+    zero, one = fx.new_zeros(()), fx.new_ones(())
+    matrix = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).reshape(1, 3, 3).to(view.device)
+    camera = {"views": view[None], "intrinsics": matrix, "coefficients": None, "model": model}
+    viewmatrix, projmatrix, campos, _ = _prepare(**camera, width=size[0], height=size[1], near=NEAR, far=math.inf)
+    return viewmatrix[0], projmatrix[0], campos[0]
 
 
 def _with_lens(effects: Effects | str | None, lens: Lens) -> Effects | str:

@@ -16,7 +16,7 @@ from .effects import Effects, Outputs
 from .outputs import before_background, named_summary, split_background
 from .seam import with_copies
 from .settings import check_settings
-from .stages import blend, list_tiles, project_once
+from .stages import Splats, TileLists, blend, list_tiles, project_once
 
 
 class _MeansGradient(torch.autograd.Function):
@@ -76,7 +76,6 @@ def render_sphere(
     fits = isinstance(opacities, torch.Tensor) and opacities.numel() == len(means3D)  # else `project` raises
     for tensor in given if fits else ():  # a row that is not finite culls its Gaussian
         opacities = torch.where(tensor.isfinite().all(1).reshape(opacities.shape), opacities, 0)
-
     splats, turns = project_once(
         [settings],
         means3D,
@@ -87,16 +86,9 @@ def render_sphere(
         rotations=rotations,
         cov3D_precomp=cov3D_precomp,
     )
-    ids = splats.gaussian_ids.long()
     radii = torch.zeros(len(means3D), dtype=torch.int32, device=means3D.device)
-    radii[ids] = splats.radii
-    sums = None
-    if means2D is not None and means2D.requires_grad and torch.is_grad_enabled():
-        sums_in_z = settings.means2d_z == "sum_abs"
-        half_size = means3D.new_tensor([size[1] / 2, size[0] / 2])
-        nothing, sums = _MeansGradient.apply(means2D, ids, half_size, sums_in_z)
-        splats = replace(splats, means2d=splats.means2d + nothing)
-        sums = sums if sums_in_z or means2D.shape[1] == 4 else None
+    radii[splats.gaussian_ids.long()] = splats.radii
+    splats, sums = _with_means_gradient(splats, means2D, size, settings.means2d_z == "sum_abs")
     splats, sums = with_copies(splats, turns, sums)
     lists = list_tiles(splats, keep=torch.is_grad_enabled())
 
@@ -116,17 +108,40 @@ def render_sphere(
     made = {"alpha": alpha[0]} if outputs.alpha else {}
     made |= zip((name for name in ("depth", "inverse_depth") if getattr(outputs, name)), others)
     if outputs.median_depth or outputs.dominant_index:
-        wanted = {name: getattr(outputs, name) for name in _C.SUMMARIES}
-        summary = torch.ops.analytic_rasterizer.inspect(
-            list(lists.tensors), splats.depths.detach(), *size, splats.footprint, splats.option, **wanted
-        )
-        of_rows = named_summary(outputs, summary)
-        if outputs.dominant_index:
-            row = of_rows["dominant_index"]
-            ids = torch.cat([splats.gaussian_ids, splats.gaussian_ids.new_tensor([-1])])  # row -1: nothing
-            of_rows["dominant_index"] = ids[row.long()]
-        made |= of_rows
+        made |= _summary(outputs, splats, lists, size)
     return color, radii, Outputs(**made)
+
+
+def _with_means_gradient(
+    splats: Splats, means2D: torch.Tensor | None, size: tuple[int, int], sums_in_z: bool
+) -> tuple[Splats, torch.Tensor | None]:
+    """Splats through which means2D gets its gradient, and (V, 2) for absolute sums; None: not wanted.
+
+    Args:
+        splats: V of them.
+        means2D: (P, 3) or (P, 4).
+        size: (height, width), px.
+        sums_in_z: Column 2 of the gradient is the total of the sums, otherwise they are columns 2 and 3 of four.
+    """
+    if means2D is None or not means2D.requires_grad or not torch.is_grad_enabled():
+        return splats, None
+    half_size = splats.means2d.new_tensor([size[1] / 2, size[0] / 2])
+    nothing, sums = _MeansGradient.apply(means2D, splats.gaussian_ids.long(), half_size, sums_in_z)
+    splats = replace(splats, means2d=splats.means2d + nothing)
+    return splats, sums if sums_in_z or means2D.shape[1] == 4 else None
+
+
+def _summary(outputs: Effects, splats: Splats, lists: TileLists, size: tuple[int, int]) -> dict[str, torch.Tensor]:
+    """Median depth and dominant index, (1, H, W) each, as far as wanted, by the names of `Outputs`."""
+    wanted = {name: getattr(outputs, name) for name in _C.SUMMARIES}
+    summary = torch.ops.analytic_rasterizer.inspect(
+        list(lists.tensors), splats.depths.detach(), *size, splats.footprint, splats.option, **wanted
+    )
+    made = named_summary(outputs, summary)
+    if outputs.dominant_index:
+        ids = torch.cat([splats.gaussian_ids, splats.gaussian_ids.new_tensor([-1])])  # row -1: nothing
+        made["dominant_index"] = ids[made["dominant_index"].long()]
+    return made
 
 
 def _check_composes(settings: Any, outputs: Effects) -> None:
