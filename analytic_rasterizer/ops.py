@@ -371,7 +371,7 @@ def _(a):
 def _(a):
     gradients = [t.new_empty(t.shape) for t in (a.means, a.log_scales, a.quats, a.logit_opacities, a.shs)]
     gradients += [a.means.new_empty(a.means.shape[0], a.mean_columns)] if a.mean_columns else []
-    gradients += [] if a.exposure is None else [a.means.new_empty(3, 4)]
+    gradients += [a.means.new_empty(t.shape) for t in (a.exposure, a.vignetting) if t is not None]
     image = a.means.new_empty(a.target.shape)
     radii = a.means.new_empty(a.means.shape[0], dtype=torch.int32)
     return a.means.new_empty(()), image, radii, gradients

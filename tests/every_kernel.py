@@ -253,6 +253,8 @@ def steps(device: str) -> None:
         )
         matrix = torch.eye(3, 4, **numbers).requires_grad_()
         torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix).sum().backward()
+        dark = {"vignetting": torch.zeros(2, **numbers).requires_grad_(), "center": [30.0, 25.0]}
+        torch.ops.analytic_rasterizer.correct_colors(torch.rand(3, 50, 60, **numbers), matrix, **dark).sum().backward()
         sums, views = torch.zeros(300, **numbers), torch.zeros(300, dtype=torch.int32, device=device)
         radii = torch.ones(300, dtype=torch.int32, device=device)
         torch.ops.analytic_rasterizer.observe_(sums, views, torch.rand(300, 3, **numbers), radii, 0)

@@ -25,7 +25,8 @@ from ..training import (
 from ..training.captures import IMAGES, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES, about_correction, measured_in_words
 from ..training.extent import seen_distance
-from ..training.files import EVALUATION, OPTIONS, SCENE, write_json
+from ..training.falloff import read_falloffs
+from ..training.files import EVALUATION, OPTIONS, SCENE, VIGNETTING, write_json
 from ..training.parts import check_scales
 from ..training.source import READING
 from ..training.start import background_of
@@ -142,6 +143,7 @@ def run_on(ranks: Ranks, args) -> None:
     protocol = protocol_of(found, args)
     options = protocol.options or TrainingOptions()
     check_scales(protocol.scales)  # raises before the capture is read
+    falloffs = [] if options.vignetting == "none" else read_falloffs(found.path.parent / VIGNETTING)
     choices = [found.choose_footprint(name) for name in args.footprints or [None]]
     orders = {str(c.footprint): found.choose_order(c.footprint, args.order) for c in choices}
     offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
@@ -169,9 +171,10 @@ def run_on(ranks: Ranks, args) -> None:
     pictures_folder = writable_folder(out / EVALUATION)
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
+    measured = {"color_corrected": True, "falloffs": falloffs}
     for footprint, order in orders.items():
         settings = common | {"order": order.order}
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, **settings, color_corrected=True)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **settings, **measured)
         if args.pictures > 0:
             save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **settings)
     if ranks.is_first:
@@ -183,7 +186,7 @@ def run_on(ranks: Ranks, args) -> None:
         write_json(out / f"{EVALUATION}.json", written)
         if args.plot is not None:
             save_plots(args.plot, evaluation_plots(results, views))
-        print(format_results(results, protocol.scales, options.exposure != "none"))
+        print(format_results(results, protocol.scales, options.exposure != "none", options.vignetting != "none"))
 
 
 def background_for(found: io.FoundScene, protocol: Protocol, capture: Capture, given) -> tuple[float, float, float]:
@@ -226,11 +229,13 @@ def part_of(scene: Gaussians, ranks: Ranks) -> Gaussians:
     return scene.rows(ranks.part_of(even_counts(scene.count, ranks.world)))
 
 
-def format_results(results: dict[str, dict], scales: tuple[int, ...], exposures_vary: bool = False) -> str:
+def format_results(
+    results: dict[str, dict], scales: tuple[int, ...], exposures_vary: bool = False, vignetted: bool = False
+) -> str:
     """A row per footprint and measure, with a column per scale and one for the mean; over how many pictures the means
-    are, and why there are two PSNR, of which the corrected one is first where exposures vary."""
+    are, and why there are two PSNR, of which the corrected one is first where the training corrected photographs."""
     rows = []
-    measures = (COLOR_CORRECTED, *MEASURES) if exposures_vary else (*MEASURES, COLOR_CORRECTED)
+    measures = (COLOR_CORRECTED, *MEASURES) if exposures_vary or vignetted else (*MEASURES, COLOR_CORRECTED)
     for footprint, measured in results.items():
         for measure in (m for m in measures if m in measured["mean"]):
             heading, layout = HEADINGS[measure]
@@ -242,4 +247,4 @@ def format_results(results: dict[str, dict], scales: tuple[int, ...], exposures_
     if len(set(said.values())) == 1:
         said = {"means": next(iter(said.values()))}
     over = "; ".join(f"{name} over {words}" for name, words in said.items())
-    return "\n".join([table, over, about_correction(exposures_vary)])
+    return "\n".join([table, over, about_correction(exposures_vary, vignetted)])

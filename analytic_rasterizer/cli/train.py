@@ -218,18 +218,19 @@ def finish(training: Run, complete: bool, args) -> None:
     if not args.no_evaluate:
         metrics = training.evaluate()
         say(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
-        tested, vary = metrics.get("test", {}), training.options.exposure != "none"
+        tested, options = metrics.get("test", {}), training.options
+        vary, vignetted = options.exposure != "none", options.vignetting != "none"
         for scale, values in tested.items():
-            say(test_line(scale, values, vary))
+            say(test_line(scale, values, vary or vignetted))
         if tested:
-            say(about_correction(vary))
+            say(about_correction(vary, vignetted))
     if training.ranks.is_first:
         print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in training.phases.items()), file=sys.stderr)
 
 
 def test_line(scale: str, values: dict, vary: bool) -> str:
-    """What the test pictures of a scale say, or all scales ("mean"). The corrected number is first where exposures
-    `vary`."""
+    """What the test pictures of a scale say, or all scales ("mean"). The corrected number is first where
+    photographs `vary`."""
     name = "mean over scales" if scale == "mean" else f"1/{scale}, {measured_in_words(values)}"
     corrected = f"after the best affine colour of each picture: PSNR {values[COLOR_CORRECTED]:.2f} dB"
     plain = f"PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}"

@@ -17,9 +17,12 @@ from torch import Tensor
 
 from ..distributed.ranks import Ranks
 from .captures import IMAGES
+from .corrections import Corrections
 from .options import TrainingOptions, as_words
 from .plan import CapturePlan, plan_capture, stops_of_photographs
 from .source import CaptureSource
+
+LEARNED_ALONE = ("exposure", "vignetting")  # options, of what several processes cannot learn
 
 
 class Settled(NamedTuple):
@@ -31,7 +34,8 @@ class Settled(NamedTuple):
         taken: Values by the names of options: what the plan decided.
         lines: What to say of it. The first lines of a training, and none on other ranks than the first.
         notes: What to say later: that the capture could not be looked at.
-        stops: Of the photographs that were looked at, as of `CapturePlan`.
+        stops, falloffs: Of the photographs that were looked at, as of `CapturePlan`; falloffs where they are wanted,
+            and None where nobody has looked.
     """
 
     options: TrainingOptions
@@ -40,6 +44,7 @@ class Settled(NamedTuple):
     lines: Sequence[str] = ()
     notes: Sequence[str] = ()
     stops: Mapping[Path, Tensor] = MappingProxyType({})
+    falloffs: Mapping[Path, tuple[Tensor, float]] | None = None
 
 
 def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[str], ranks: Ranks) -> Settled:
@@ -56,7 +61,7 @@ def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[s
     defaults = {field.name: field.default for kind in (options, source) for field in fields(kind)}
     values, given = plan.options, options.to_dict() | vars(source)
     kept = [name for name in values if name in chosen or given[name] != defaults[name]]
-    alone = [] if ranks.world == 1 or "exposure" in kept else ["exposure"]  # which several ranks cannot learn
+    alone = [] if ranks.world == 1 else [name for name in LEARNED_ALONE if name not in kept]
     taken = {name: value for name, value in values.items() if name not in (*kept, *alone)}
     of_source = {name: value for name, value in taken.items() if name in vars(source)}
     of_options = {name: value for name, value in taken.items() if name not in of_source}
@@ -81,7 +86,8 @@ def settle(source: CaptureSource, options: TrainingOptions, chosen: Collection[s
                 f"begins with {begun.first_footprint}, and goes on with {begun.footprint} when "
                 f"{_time(begun.footprint_from)} over (--first-footprint none: does not)"
             )
-    return Settled(begun, replace(source, **of_source), taken, lines, [], plan.stops)
+    falloffs = plan.falloffs if begun.vignetting != "none" else {}
+    return Settled(begun, replace(source, **of_source), taken, lines, [], plan.stops, falloffs)
 
 
 def _time(time: float) -> str:
@@ -117,6 +123,18 @@ def measured_stops(source: CaptureSource, files: Sequence[Path], known: Mapping[
         return stops_of_photographs(source.folder, files, source.images or IMAGES, cameras=source.cameras)
     except Exception:
         return torch.full((len(files), 3), math.nan, dtype=torch.float64)
+
+
+def start_corrections(corrections: Corrections, source: CaptureSource, files: Sequence[Path], found: Settled) -> None:
+    """Corrections start from what was measured, of photographs `files`; it is measured where nobody has looked."""
+    if corrections.exposures is not None:
+        corrections.exposures.start(measured_stops(source, files, found.stops))
+    if corrections.falloffs is not None:
+        measured = found.falloffs
+        if measured is None:
+            plan = _look(source)
+            measured = {} if isinstance(plan, str) else plan.falloffs
+        corrections.falloffs.start({place: measured[file] for place, file in enumerate(files) if file in measured})
 
 
 def _look(source: CaptureSource) -> CapturePlan | str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -19,6 +19,7 @@ from ..gaussians import Gaussians
 from ..losses import counted, ssim
 from ..render.settings import GaussianRasterizationSettings
 from .exposure import best_exposure, corrected
+from .falloff import Known, falloff_of
 from .pictures import Pictures
 from .rendering import render, render_together
 
@@ -77,6 +78,7 @@ def evaluate(
     *,
     supersampling: int = 1,
     color_corrected: bool = False,
+    falloffs: Sequence[Known] = (),
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> dict[str, dict]:
@@ -90,6 +92,7 @@ def evaluate(
         supersampling: As in `TrainingOptions`.
         color_corrected: Also measure "psnr_color_corrected", after the affine map of colours that is best for each
             picture, by least squares.
+        falloffs: Cameras whose vignetting is known. Pictures of views of one of them have it before that map.
         ranks: Those that share the scene and the views. All of them get all results.
         **options: Further settings.
 
@@ -117,7 +120,8 @@ def evaluate(
             if lpips is not None:
                 values.append(lpips(*counted(image, truth, mask)).reshape(()))
             if color_corrected:
-                values.append(psnr(corrected(image, best_exposure(image, truth, mask)), truth, mask))
+                dark = vignetted(image, pictures.views[view], falloffs)
+                values.append(psnr(corrected(dark, best_exposure(dark, truth, mask)), truth, mask))
             measured[view] = torch.stack(values)
             if mask is not None:
                 measured[view] = torch.where(mask.any(), measured[view], math.nan)
@@ -129,6 +133,15 @@ def evaluate(
     pictures.close()
     results["mean"] = _means(list(results.values()), names)
     return results
+
+
+def vignetted(image: Tensor, view: io.View, falloffs: Sequence[Known]) -> Tensor:
+    """A rendered picture (3, H, W) as the camera of its view would show it; as it is where that is not known."""
+    found = falloff_of(view, falloffs)
+    if found is None:
+        return image
+    center = [c * n / length for c, n, length in zip(view.middle, image.shape[:0:-1], (view.width, view.height))]
+    return corrected(image, None, image.new_tensor(found), center)
 
 
 def _mean_ssim(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
@@ -158,8 +171,13 @@ def measured_in_words(of_scale: dict[str, Any]) -> str:
     return pictures if known == count else f"{known} of {pictures}, nothing counts in the others"
 
 
-def about_correction(exposures_vary: bool) -> str:
-    """Why there are two numbers, in a line; the corrected one comes first where the training corrected exposures."""
+def about_correction(exposures_vary: bool, vignetted: bool = False) -> str:
+    """Why there are two numbers, in a line; the corrected one comes first where the training corrected photographs."""
+    if vignetted:
+        return (
+            "test photographs keep exposure and vignetting, which no scene has: the number after the vignetting of "
+            "their cameras and the best affine colour of each picture counts"
+        )
     if exposures_vary:
         return (
             "test photographs keep their own exposures, which no scene has: the number after the best affine colour of "

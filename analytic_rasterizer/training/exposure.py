@@ -7,6 +7,7 @@ the test have no correction; `best_exposure` finds what would bring a picture ne
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -74,9 +75,14 @@ class Exposures:
         self.steps = state["steps"]
 
 
-def corrected(image: Tensor, exposure: Tensor | None) -> Tensor:
-    """A rendered picture (3, H, W) as a photograph with this exposure (3, 4) would have it."""
-    return image if exposure is None else torch.ops.analytic_rasterizer.correct_colors(image, exposure)
+def corrected(
+    image: Tensor, exposure: Tensor | None, vignetting: Tensor | None = None, center: Sequence[float] = ()
+) -> Tensor:
+    """A rendered picture (3, H, W) as a photograph with this exposure (3, 4) would have it, of a camera with such
+    vignetting: coefficients (2,) of `Falloffs`, about the principal point `center` [px]."""
+    if exposure is None and vignetting is None:
+        return image
+    return torch.ops.analytic_rasterizer.correct_colors(image, exposure, vignetting, center)
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from ..io.writing import as_json, write_json, write_safely, write_text  # noqa: 
 CHECKPOINT = "checkpoint.pt"
 MIP_SCENE = "point_cloud_mip.ply"
 EXPOSURES = "exposures.json"  # as of 3DGS: 3x4 by the name of a photograph
+VIGNETTING = "vignetting.json"  # of `Falloffs`
 METRICS, LOG = "metrics.json", "log.jsonl"
 EVALUATION = "evaluation"  # the folder of pictures, and the name of the .json
 CHECKPOINT_FORMAT = 3

@@ -183,6 +183,7 @@ class TrainingOptions:
     order: str = SceneOptions.order
     effects: str = PictureOptions.effects
     exposure: str = PictureOptions.exposure
+    vignetting: str = PictureOptions.vignetting
     seed: int = LengthOptions.seed
     random_points: int = StartOptions.random_points
     ssim_weight: float = LossOptions.ssim_weight

@@ -19,6 +19,7 @@ from .depth_files import UNIT
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 EFFECTS = ("auto", "none")
 EXPOSURES = ("none", "affine")
+VIGNETTINGS = ("none", "polynomial")
 DEPTHS = ("none", "points", "maps")
 DEPTH_FITS = ("auto", "none")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
@@ -165,6 +166,12 @@ class PictureOptions(Options):
         '"affine": learn a colour correction (3x4) for each training photograph, for captures whose exposure or white '
         'balance varies. It is applied before the loss; the scene has no correction. "none": none.',
         one_of(EXPOSURES),
+    )
+    vignetting: str = option(
+        "none",
+        '"polynomial": learn for each camera how much darker it shows what is far from its principal point, an even '
+        'polynomial of the radius. It is applied before the loss; the scene has none. "none": none.',
+        one_of(VIGNETTINGS),
     )
 
     def __post_init__(self):

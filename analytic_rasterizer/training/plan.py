@@ -39,6 +39,7 @@ LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
 EXPOSURE = {True: (0.15, 0.15), False: (0.15, 0.3)}  # stops
 WHITE_BALANCE = {True: (5.0, 5.0), False: (5.0, 15.0)}  # percent
 VIGNETTING = 0.15  # stops: bonsai has 0.53, mouse 0.37; fox has 0.1, brighter to the left
+FAR = 0.5  # halves of the diagonal, to which vignetting must be measured: mouse has 0.38, and corrected loses 1 dB
 MIDDLE = 0.1  # of photographs that a spread leaves out: some see few points
 # Stops from the middle, from which on one photograph is odd: those of even and uneven captures have up to 0.65 (mouse),
 # and in the balance of colours 0.32 (fox).
@@ -81,6 +82,16 @@ class CapturePlan:
     def stops(self) -> dict[Path, torch.Tensor]:
         """By the paths of the photographs that were read: (3,) of `stops_of_photographs`."""
         return {} if self.survey is None else self.survey.stops
+
+    @property
+    def falloffs(self) -> dict[Path, tuple[torch.Tensor, float]]:
+        """The same of their cameras' vignetting: slopes (2,) of `Falloff`, and the radius up to which they hold."""
+        if self.survey is None:
+            return {}
+        items = self.survey.looked_at
+        found = falloffs_of(self.survey.evidence, [item.view for item in items])
+        known = [falloff for falloff in found if falloff.radius >= FAR]
+        return {items[place].files[1]: (each.slopes, each.radius) for each in known for place in each.photographs}
 
     @property
     def options(self) -> dict[str, Any]:
@@ -345,9 +356,11 @@ def _vignetting(survey: Survey) -> Finding:
     verdict = YES
     if worst.least <= worst.stops / 2:
         verdict, reason = NOT_KNOWN, f"{reason}; not in all directions, in one {worst.least:.2g}"
+    elif worst.radius < FAR:
+        verdict, reason = NOT_KNOWN, f"{reason}; too few points are farther out"
     elif not survey.tracked:
         verdict, reason = NOT_KNOWN, f"{reason}; without tracks this may be hidden points"
-    return Finding(effect, worst.stops, unit, verdict, reason)
+    return Finding(effect, worst.stops, unit, verdict, reason, {"vignetting": "polynomial"} if verdict == YES else {})
 
 
 def _in_unit(stops: float, effect: str) -> float:

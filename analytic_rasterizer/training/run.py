@@ -18,14 +18,13 @@ from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
-from .automatic import Settled, measured_stops, said_first, settle
+from .automatic import LEARNED_ALONE, Settled, said_first, settle, start_corrections
 from .captures import Photograph
 from .depth_targets import depths_of
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
     CHECKPOINT,
-    EXPOSURES,
     LOG,
     METRICS,
     MIP_SCENE,
@@ -129,20 +128,19 @@ class Run:
             stored = TrainingOptions.from_dict(state["options"])
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
-        for name in ("exposure", "depth"):
+        for name in (*LEARNED_ALONE, "depth"):
             if ranks.world > 1 and getattr(self.options, name) != "none":
                 raise ValueError(f"{name} must be none for {ranks.world} processes, got {getattr(self.options, name)}")
         if tensorboard:
             io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
         self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)
         if state is None:
-            stops = self._begin(source, chosen)
+            found = self._begin(source, chosen)
+            with self._phase("look"):
+                files = [item.files[1] for item in self.capture.train]
+                start_corrections(self.trainer.corrections, source, files, found)
         else:
             self._continue(source, state)
-        if self.trainer.exposures is not None and state is None:
-            files = [item.files[1] for item in self.capture.train]
-            with self._phase("look"):
-                self.trainer.exposures.start(measured_stops(source, files, stops))
         self.clock, self.history = Clock(self.device), []
         if state is not None:
             self._load_state(state, stored)
@@ -151,8 +149,8 @@ class Run:
         results_folder(self.out)
         self.phases["load"] = time.perf_counter() - began - self.phases["look"]
 
-    def _begin(self, source: CaptureSource, chosen: Collection[str]) -> Mapping[Path, torch.Tensor]:
-        """Looks at the capture, loads it, and makes the trainer. Returns stops of photographs as `settle` has them."""
+    def _begin(self, source: CaptureSource, chosen: Collection[str]) -> Settled:
+        """Looks at the capture, loads it, and makes the trainer. Returns what `settle` has found."""
         found = Settled(self.options, source)
         if self.options.effects == "auto":
             with self._phase("look"):
@@ -165,7 +163,7 @@ class Run:
             start, self.points_found, self.options, said = begin(self.options, self.capture, source.points, chosen)
             self.notes = [*found.notes, *self.capture.notes, *said]
             self._make_trainer(start, None)  # an error of its pictures is one line, too
-        return found.stops
+        return found
 
     def _continue(self, source: CaptureSource, state: dict[str, Any]) -> None:
         """Loads the capture of a training that is resumed, in its coordinates, and makes the trainer."""
@@ -313,9 +311,7 @@ class Run:
             scene = self._whole(self.trainer.scene(), SCENE)
             if self.ranks.is_first:
                 write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset, self.options.order)
-                if self.trainer.exposures is not None:
-                    names = [view.name for view in self.trainer.pictures.views]
-                    write_json(self.out / EXPOSURES, dict(zip(names, self.trainer.exposures.matrices.tolist())))
+                self.trainer.corrections.write(self.out)
         self.save()
         if self.board is not None:
             self.board.close()
@@ -425,7 +421,7 @@ class Run:
                 memory = self.memory.less(self.trainer.pictures.store.plan, self.device)
                 pictures = self._load(self.capture.test, background, memory)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks, "color_corrected": True}
-                common |= {"order": self.options.order}
+                common |= {"order": self.options.order, "falloffs": self.trainer.corrections.known()}
                 metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
         metrics["phases"] = self.ranks.from_first(phases)

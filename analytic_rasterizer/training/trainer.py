@@ -20,8 +20,8 @@ from ..render.arguments import camera_arguments
 from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
+from .corrections import Corrections
 from .depth_targets import Targets
-from .exposure import Exposures
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
 from .optimizer import TrainingAdam
@@ -124,7 +124,7 @@ class Trainer:
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
-        self.exposures = Exposures(len(pictures.views), self.device) if options.exposure == "affine" else None
+        self.corrections = Corrections(options, pictures.views, self.device)
         self.filter_3d: Tensor | None = None
         share = 1 / options.pictures_per_step  # of a picture's loss in that of the step
         self.dL_dloss = torch.full((), share, dtype=torch.float32, device=self.device)
@@ -263,9 +263,9 @@ class Trainer:
     def _differentiate(self) -> tuple[Tensor, Tensor | None]:
         """The loss of the next step, and with `sparse_adam` the rows that the optimizer updates: what a picture shows.
 
-        Gradients of the loss are those of the parameters, and density control and the exposures have seen theirs.
+        Gradients of the loss are those of the parameters, and density control and the corrections have seen theirs.
         """
-        fields, losses, of_exposures = list(self.gaussians), [], {}
+        fields, losses = list(self.gaussians), []
         visible: Tensor | None = None
         for shown in self._next():
             loss, radii, gradients = self._differentiate_picture(shown)
@@ -277,13 +277,10 @@ class Trainer:
             losses.append(loss)
             if self._watches(shown.scale):
                 self.density.observe_gradients(gradients[len(fields)], radii)
-            if self.exposures is not None:
-                earlier = of_exposures.get(shown.view)  # The step may have this view at several scales.
-                of_exposures[shown.view] = gradients[-1] if earlier is None else earlier + gradients[-1]
+            self.corrections.observe(shown.view, gradients)
             if self.options.sparse_adam:
                 visible = radii > 0 if visible is None else visible | (radii > 0)
-        if self.exposures is not None:
-            self.exposures.update(of_exposures, self.progress.share)
+        self.corrections.update(self.progress.share)
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean(), visible
 
     def _differentiate_picture(self, shown: Shown) -> tuple[Tensor, Tensor, list[Tensor]]:
@@ -306,9 +303,9 @@ class Trainer:
 
     def _comparison(self, shown: Shown) -> dict[str, Any]:
         """How a rendering becomes a loss, by the names of the ops."""
-        return {
-            "target": self.pictures.target(shown.scale, shown.view, shown.background),
-            "exposure": None if self.exposures is None else self.exposures.matrices[shown.view],
+        target = self.pictures.target(shown.scale, shown.view, shown.background)
+        return self.corrections.arguments(shown.view, target) | {
+            "target": target,
             "mask": self.pictures.mask(shown.scale, shown.view),
             "ssim_weight": self.options.ssim_weight,
             "supersampling": self.options.supersampling,
@@ -399,10 +396,9 @@ class Trainer:
             "progress": self.progress.state_dict(),
             "generator": self.generator.get_state(),
             "filter_3d": self.filter_3d,
-            "exposures": None if self.exposures is None else self.exposures.state_dict(),
             "extent": self.extent,
             "dropped": self.dropped,
-        }
+        } | self.corrections.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from the `state` that `state_dict` gave."""
@@ -416,8 +412,7 @@ class Trainer:
         self.progress.load_state_dict(state["progress"])
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
-        if self.exposures is not None:
-            self.exposures.load_state_dict(state["exposures"])
+        self.corrections.load_state_dict(state)
         self.losses, self._last = [], None
         # Checkpoints of earlier versions have neither.
         self.extent = self.density.extent = state.get("extent", self.extent)

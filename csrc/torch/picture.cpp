@@ -202,22 +202,25 @@ L1SsimArguments comparison_of(const LossArguments& a, const Tensor& image) {
 
 struct Loss {
   Tensor value, shown;  ///< (), and the image as compared with the target, but for the mask.
-  Tensor dL_drendered, dL_dexposure;
+  Tensor dL_drendered, dL_dexposure, dL_dvignetting;
 
   Loss(const LossArguments& a, const Tensor& rendered) {
     const Tensor image = averaged(rendered, a.supersampling);
-    shown = a.exposure ? correct_colors({image, *a.exposure})[0].toTensor() : image;
+    const bool corrects = a.exposure || a.vignetting;
+    const CorrectArguments correction = {image, a.exposure, a.vignetting, a.center};
+    shown = corrects ? correct_colors(correction)[0].toTensor() : image;
     const L1SsimArguments comparison = comparison_of(a, shown);
     const Results compared = l1_ssim(comparison);
     value = compared[0].toTensor();
     Tensor dL_dimage =
         gradients_of(l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}}))[0];
     if (a.mask) dL_dimage = dL_dimage.mul(*a.mask);
-    if (a.exposure) {
+    if (corrects) {
       const std::vector<Tensor> of_correction =
-          gradients_of(correct_colors_vjp({{dL_dimage}, {image, *a.exposure}, {}, {true, true}}));
+          gradients_of(correct_colors_vjp({{dL_dimage}, correction, {}, {true, true, true}}));
       dL_dimage = of_correction[0];
       dL_dexposure = of_correction[1];
+      dL_dvignetting = of_correction[2];
     }
     dL_drendered = averaged_vjp(dL_dimage, rendered, a.supersampling);
   }
@@ -265,6 +268,7 @@ template <class Rendering> Results gradients_through(const PictureArguments& a, 
   std::vector<Tensor> gradients = {grads.means3D, of_parameters[0], of_parameters[1], of_parameters[2], grads.shs};
   if (a.mean_columns > 0) gradients.push_back(grads.means2D);
   if (a.exposure) gradients.push_back(loss.dL_dexposure);
+  if (a.vignetting) gradients.push_back(loss.dL_dvignetting);
   return {loss.value, loss.shown, rendering.radii, gradients};
 }
 

@@ -42,6 +42,10 @@ Tensor room_for(bool wanted, const Tensor& like) {
   return at::empty(wanted ? like.sizes() : at::IntArrayRef({0}), like.options());
 }
 
+CorrectTensors correction_of(const CorrectArguments& a) {
+  return {a.image, a.matrix.value_or(Tensor()), a.vignetting.value_or(Tensor()), a.center};
+}
+
 Results run_ssim_vjp(const SsimTensors& t) {
   training_kernels(t.image).ssim_vjp(t);
   return {std::vector<Tensor>{t.dL_dimage, at::empty({0}, t.image.options())}};
@@ -136,7 +140,7 @@ Results apply_3d_filter_vjp(VjpArguments<FilterArguments> arguments) {
 
 Results correct_colors(CorrectArguments a) {
   check(a);
-  CorrectTensors t = {a.image, a.matrix};
+  CorrectTensors t = correction_of(a);
   t.corrected = at::empty(a.image.sizes(), a.image.options());
   training_kernels(a.image).correct_colors(t);
   return {t.corrected};
@@ -145,13 +149,14 @@ Results correct_colors(CorrectArguments a) {
 Results correct_colors_vjp(VjpArguments<CorrectArguments> arguments) {
   CorrectArguments& a = arguments.of_op;
   check(a);
-  check_needs(arguments.needs, 2);
-  CorrectTensors t = {a.image, a.matrix};
+  check_needs(arguments.needs, 3);
+  CorrectTensors t = correction_of(a);
   t.dL_dcorrected = only_gradient_of(arguments.dL_doutputs, "corrected", a.image, a.image.sizes());
   t.dL_dimage = room_for(arguments.needs[0], a.image);
-  t.dL_dmatrix = room_for(arguments.needs[1], a.matrix);
+  t.dL_dmatrix = room_for(arguments.needs[1] && a.matrix, a.matrix.value_or(a.image));
+  t.dL_dvignetting = room_for(arguments.needs[2] && a.vignetting, a.vignetting.value_or(a.image));
   training_kernels(a.image).correct_colors_vjp(t);
-  return {std::vector<Tensor>{t.dL_dimage, t.dL_dmatrix}};
+  return {std::vector<Tensor>{t.dL_dimage, t.dL_dmatrix, t.dL_dvignetting}};
 }
 
 Results observe(ObserveArguments a) {

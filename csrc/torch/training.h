@@ -42,10 +42,11 @@ struct FilterTensors {
 };
 
 struct CorrectTensors {
-  Tensor image, matrix;
+  Tensor image, matrix, vignetting;
+  std::vector<double> center;  ///< Empty without vignetting.
   Tensor corrected;
   Tensor dL_dcorrected;
-  Tensor dL_dimage, dL_dmatrix;
+  Tensor dL_dimage, dL_dmatrix, dL_dvignetting;
 };
 
 /// On the device's current stream.
@@ -177,6 +178,8 @@ template <typename T, class Params> void set_correction(Params& p, const Correct
   p.pixels = t.image.numel() / 3;
   p.image = const_pointer<T>(t.image);
   p.matrix = const_pointer<T>(t.matrix);
+  p.vignetting = const_pointer<T>(t.vignetting);
+  if (p.vignetting) p.radii = radii_of<T>(t.image.size(1), t.image.size(2), t.center[0], t.center[1]);
 }
 
 template <typename T> CorrectParams<T> correct_params(const CorrectTensors& t) {
@@ -192,6 +195,7 @@ template <typename T> CorrectVjpParams<T> correct_vjp_params(const CorrectTensor
   p.dL_dcorrected = const_pointer<T>(t.dL_dcorrected);
   p.dL_dimage = pointer<T>(t.dL_dimage);
   p.dL_dmatrix = pointer<T>(t.dL_dmatrix);
+  p.dL_dvignetting = pointer<T>(t.dL_dvignetting);
   return p;
 }
 

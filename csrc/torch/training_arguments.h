@@ -60,20 +60,26 @@ struct FilterArguments {
 
 /// See core/color_correction.h.
 struct CorrectArguments {
-  Tensor image;   ///< (3, H, W).
-  Tensor matrix;  ///< (3, 4).
+  Tensor image;                ///< (3, H, W).
+  OptionalTensor matrix;       ///< (3, 4).
+  OptionalTensor vignetting;   ///< (2,).
+  std::vector<double> center;  ///< With it: x and y of the principal point, px.
 
   template <class Visit> void each(Visit&& visit) {
     visit("image", image);
     visit("matrix", matrix);
+    visit("vignetting=None", vignetting);
+    visit("center=[]", center);
   }
 };
 
 /// How a rendering becomes a loss.
 struct LossArguments {
-  Tensor target, dL_dloss;  ///< As of `l1_ssim`.
-  OptionalTensor exposure;  ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor mask;      ///< (H, W) of the share of each pixel that counts: a factor of both images.
+  Tensor target, dL_dloss;     ///< As of `l1_ssim`.
+  OptionalTensor exposure;     ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
+  OptionalTensor vignetting;   ///< (2,): see core/color_correction.h.
+  std::vector<double> center;  ///< With it: x and y of the principal point of the target, px.
+  OptionalTensor mask;         ///< (H, W) of the share of each pixel that counts: a factor of both images.
   double ssim_weight = 0;
   int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.
 
@@ -81,6 +87,8 @@ struct LossArguments {
     visit("target", target);
     visit("dL_dloss", dL_dloss);
     visit("exposure", exposure);
+    visit("vignetting", vignetting);
+    visit("center", center);
     visit("mask", mask);
     visit("ssim_weight", ssim_weight);
     visit("supersampling", supersampling);

@@ -116,6 +116,22 @@ void check_pixels(const Tensor& t, const char* name, const Like& like, const Ten
 }
 
 /// `like`: of the rendering, which has this size.
+void check_correction(const OptionalTensor& matrix, const char* name, const OptionalTensor& vignetting,
+                      const std::vector<double>& center, const Like& like) {
+  if (matrix) {
+    like.check_type(*matrix, name);
+    check_shape(matrix->sizes() == at::IntArrayRef({3, 4}), *matrix, name, "(3, 4)");
+  }
+  const size_t numbers = vignetting ? 2 : 0;
+  TORCH_CHECK_VALUE(center.size() == numbers, "center must have two numbers with vignetting, and none without, got ",
+                    center.size());
+  if (!vignetting) return;
+  like.check_type(*vignetting, "vignetting");
+  check_shape(vignetting->sizes() == at::IntArrayRef({2}), *vignetting, "vignetting", "(2,)");
+  TORCH_CHECK_VALUE(std::isfinite(center[0]) && std::isfinite(center[1]), "center must be finite, got ", center[0],
+                    " and ", center[1]);
+}
+
 void check_loss(const LossArguments& a, const Like& like, int64_t height, int64_t width) {
   TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
   like.check_type(a.dL_dloss, "dL_dloss");
@@ -127,10 +143,7 @@ void check_loss(const LossArguments& a, const Like& like, int64_t height, int64_
                     width, ", got ", times);
   const std::vector<int64_t> image = {3, height / times, width / times};
   check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
-  if (a.exposure) {
-    like.check_type(*a.exposure, "exposure");
-    check_shape(a.exposure->sizes() == at::IntArrayRef({3, 4}), *a.exposure, "exposure", "(3, 4)");
-  }
+  check_correction(a.exposure, "exposure", a.vignetting, a.center, like);
   if (a.mask) check_pixels(*a.mask, "mask", like, a.target);
 }
 
@@ -224,9 +237,9 @@ void check(CorrectArguments& a) {
   check_image_size(a.image.size(1), a.image.size(2));
   a.image = a.image.contiguous();
   const Like like{a.image, "image"};
-  like.check_type(a.matrix, "matrix");
-  check_shape(a.matrix.sizes() == at::IntArrayRef({3, 4}), a.matrix, "matrix", "(3, 4)");
-  a.matrix = a.matrix.contiguous();
+  check_correction(a.matrix, "matrix", a.vignetting, a.center, like);
+  if (a.matrix) a.matrix = a.matrix->contiguous();
+  if (a.vignetting) a.vignetting = a.vignetting->contiguous();
 }
 
 void check(PictureArguments& a) {

@@ -69,8 +69,8 @@ class CudaTrainingKernels final : public TrainingKernels {
     visit_scalar(t.image, [&](auto scalar) {
       using T = decltype(scalar);
       const auto p = correct_vjp_params<T>(t);
-      const int64_t blocks = p.dL_dmatrix ? cuda::correct_blocks(p.pixels) : 0;
-      const Tensor block_sums = at::empty({blocks, kCorrection}, t.image.options());
+      const int64_t blocks = p.sums() ? cuda::correct_blocks(p.pixels) : 0;
+      const Tensor block_sums = at::empty({blocks, kCorrection + kVignetting}, t.image.options());
       on_stream(t.image, [&](cudaStream_t stream) { cuda::correct_colors_vjp(p, pointer<T>(block_sums), stream); });
     });
   }

@@ -85,8 +85,8 @@ def test_wrong_calls():
     three = [torch.zeros(4, n) for n in (3, 4, 1)]
     with pytest.raises(TypeError, match="activate got log_scales, which it does not have, or has by its place"):
         _C.Call("activate")(*three, log_scales=three[0])
-    with pytest.raises(TypeError, match="correct_colors takes 2 arguments, got 3"):
-        _C.Call("correct_colors")(*three)
+    with pytest.raises(TypeError, match="apply_3d_filter takes 3 arguments, got 4"):
+        _C.Call("apply_3d_filter")(*three, three[0])
     with pytest.raises(TypeError, match="is of a type that Call does not take"):  # lists
         _C.Call("rasterize_vjp")([None])
 

@@ -648,7 +648,8 @@ def calls_of(device, camera=0):
     adjoint = arguments | {"dL_drows": dL_drows, "ids": ids, "needs": needs} | places
     target = torch.rand(color.shape, generator=torch.Generator().manual_seed(0), dtype=color.dtype).to(device)
     loss = {"target": target, "dL_dloss": target.new_tensor(0.5), "ssim_weight": 0.2, "supersampling": 1}
-    picture = {"rows": rows[:n], "exposure": None, "mask": None, "bg": background, "absolute": True} | loss | image
+    picture = {"rows": rows[:n], "bg": background, "absolute": True} | loss | image
+    picture |= {"exposure": None, "vignetting": None, "center": [], "mask": None}
     return dict(zip(OPS, (arguments, packed, adjoint, blended, back, picture)))
 
 

@@ -13,7 +13,7 @@ import torch
 from capture_files import circle, draw_picture, write_nerf_synthetic
 from cli_extra import image
 from commands import refused
-from training_step import check_next_step
+from training_step import check_next_step, falloff
 
 from analytic_rasterizer import training
 from analytic_rasterizer.training import files
@@ -23,21 +23,24 @@ OP = torch.ops.analytic_rasterizer.correct_colors
 
 
 # Fewer pixels than a block has threads, and several blocks, the last of which is not full.
+@pytest.mark.parametrize("vignetted", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (91, 77)], ids=str)
-def test_a_correction_and_its_gradients(device, size):
+def test_a_correction_and_its_gradients(device, size, vignetted):
     generator = torch.Generator().manual_seed(0)
     shown, given = (torch.rand(3, *size, generator=generator, dtype=torch.float64) for _ in range(2))
     exposure = torch.rand(3, 4, generator=generator, dtype=torch.float64)
-    leaves = [shown.requires_grad_(), exposure.requires_grad_()]
-    expected = torch.einsum("ij,jhw->ihw", exposure[:, :3], shown) + exposure[:, 3, None, None]
+    vignetting, center = torch.tensor([-0.4, 0.2], dtype=torch.float64), (0.4 * size[1], 0.7 * size[0])
+    leaves = [shown.requires_grad_(), exposure.requires_grad_(), vignetting.requires_grad_()][: 2 + vignetted]
+    dark = shown * falloff(*size, vignetting, center) if vignetted else shown
+    expected = torch.einsum("ij,jhw->ihw", exposure[:, :3], dark) + exposure[:, 3, None, None]
     gradients = torch.autograd.grad(expected, leaves, given)
     for dtype, epsilon in ((torch.float64, 2.0**-52), (torch.float32, 2.0**-23)):
         moved = [t.detach().to(device, dtype).requires_grad_() for t in leaves]
-        found = corrected(*moved)
+        found = corrected(*moved, center=center if vignetted else ())
         of_leaves = torch.autograd.grad(found, moved, given.to(device, dtype))
         # Colours are below 4. A sum of n numbers below 1 is good to n * epsilon / 2 of at most n, in any order.
         pixels = size[0] * size[1]
-        for a, b, bound in zip((expected, *gradients), (found, *of_leaves), (8, 8, max(8, pixels**2))):
+        for a, b, bound in zip((expected, *gradients), (found, *of_leaves), (8, 8, *[max(8, pixels**2)] * 2)):
             assert (a - b.double().cpu()).abs().max() < bound * epsilon
     assert corrected(shown, None) is shown
 
@@ -45,9 +48,14 @@ def test_a_correction_and_its_gradients(device, size):
 def test_opcheck_of_corrections(device):
     shown, exposure = torch.rand(3, 4, 5, device=device), torch.rand(3, 4, device=device)
     torch.library.opcheck(OP.default, (shown.clone().requires_grad_(), exposure.clone().requires_grad_()))
+    dark = torch.tensor([-0.1, 0.05], device=device, requires_grad=True), [2.0, 1.0]
+    torch.library.opcheck(OP.default, (shown.clone().requires_grad_(), None, *dark))
     vjp = torch.ops.analytic_rasterizer.correct_colors_vjp.default
-    for needs in ([True, True], [True, False], [False, True]):
-        torch.library.opcheck(vjp, ([torch.rand_like(shown)], shown, exposure, [], needs))
+    for needs in ([True, True, False], [True, False, False], [False, True, False]):
+        torch.library.opcheck(vjp, ([torch.rand_like(shown)], shown, exposure, None, [], [], needs))
+    for matrix, needs in ((exposure, [True] * 3), (exposure, [False, False, True]), (None, [True, False, True])):
+        given = shown, matrix, dark[0].detach(), dark[1]
+        torch.library.opcheck(vjp, ([torch.rand_like(shown)], *given, [], needs))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +139,7 @@ run_of = functools.partial(runs.trained, **KNOWN)
 def test_a_step_has_the_gradients_of_autograd(uneven, tmp_path, options):
     """Also where a view is in a step several times."""
     run = run_of(uneven, tmp_path / "out", iterations=12, exposure="affine", **options)
-    assert (run.trainer.exposures.matrices != torch.eye(3, 4)).any()
+    assert (run.trainer.corrections.exposures.matrices != torch.eye(3, 4)).any()
     check_next_step(run.trainer)
 
 

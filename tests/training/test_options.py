@@ -20,6 +20,7 @@ OTHERS |= {"background": "white", "effects": "none", "exposure": "affine", "grad
 OTHERS |= {"prune_opacity": 0.25, "initial_opacity": 0.25, "densify_from": 0.25, "rates_from": 0.5}
 OTHERS |= {"ssim_weight": 0.5, "grow_share": 0.5, "densify_until": 0.5, "footprint_from": 0.5}
 OTHERS |= {"first_footprint": "box:samples=1", "order": "ray", "depth": "points", "depth_fit": "none"}
+OTHERS |= {"vignetting": "polynomial"}
 
 
 def other_value(name):
@@ -60,7 +61,7 @@ def test_an_option_is_kept_in_its_part(name):
 
 def test_files_have_all_options_in_the_same_order():
     """Those of another density control too, with their defaults: other versions read them."""
-    assert NAMES[0] == "footprint" and NAMES[-1] == "depth_unit" and len(NAMES) == 54
+    assert NAMES[0] == "footprint" and NAMES[-1] == "depth_unit" and len(NAMES) == 55
     for density in DENSITIES:
         assert list(TrainingOptions(density=density).to_dict()) == NAMES
 

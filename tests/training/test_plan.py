@@ -272,7 +272,8 @@ def test_medians():
 def test_options_are_those_of_train():
     source = Path(plan.__file__).read_text(encoding="utf-8")
     named = dict(re.findall(r'{"([a-z]+)": "([a-z]+)"}', source))
-    assert named == {"exposure": "affine", "lens": "keep", "masks": "auto", "missing": "skip"}
+    corrections = {"exposure": "affine", "vignetting": "polynomial"}
+    assert named == {**corrections, "lens": "keep", "masks": "auto", "missing": "skip"}
     for name, value in {**named, "scales": plan.SCALES}.items():
         words = as_words({name: value}).split(" ")
         assert getattr(cli.build_parser().parse_args(["train", "SCENE", "--out", "DIR", *words]), name) == value

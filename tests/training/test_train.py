@@ -437,6 +437,8 @@ def test_the_command_takes_deterministic(synthetic, tmp_path, capsys):
         {"supersampling": 2},
         {"filter_3d": True},
         {"exposure": "affine"},
+        {"vignetting": "polynomial"},
+        {"exposure": "affine", "vignetting": "polynomial", "supersampling": 2, "scales": (1, 2)},
         {"opacity_weight": 0.1, "scale_weight": 0.2, "filter_3d": True, "supersampling": 3, "pictures_per_step": 3},
     ],
     ids=str,
@@ -449,7 +451,7 @@ def test_a_step_has_the_gradients_of_autograd(device, synthetic, tmp_path, optio
 
 
 FIELDS = ("means", "log_scales", "quats", "logit_opacities", "shs")
-PARTS = ("", "mask", "exposure", "filter", "supersampling", "regularizers", "depth", "all")
+PARTS = ("", "mask", "exposure", "vignetting", "filter", "supersampling", "regularizers", "depth", "all")
 
 
 def settings_of(lens, device, dtype=torch.float32):
@@ -469,6 +471,7 @@ def picture_arguments(device, parts="", lens=None, dtype=torch.float32, **change
     of_parts = {
         "mask": {"mask": torch.rand(size, generator=generator)},
         "exposure": {"exposure": torch.eye(3, 4) + 0.1 * torch.rand(3, 4, generator=generator)},
+        "vignetting": {"vignetting": torch.tensor([-0.4, 0.1]), "center": [0.4 * size[1], 0.55 * size[0]]},
         "filter": {"filter_3d": 0.3 * torch.rand(len(log_scales), generator=generator)},
         "regularizers": {"opacity_weight": 0.3, "scale_weight": 0.2},
         "depth": {
@@ -480,7 +483,7 @@ def picture_arguments(device, parts="", lens=None, dtype=torch.float32, **change
     }
     given = dict(zip(FIELDS, gaussians._replace(log_scales=log_scales)))
     given |= {"dL_dloss": torch.tensor(0.75), "bg": torch.full((3,), 0.2), "exposure": None, "mask": None}
-    given |= {"supersampling": times}
+    given |= {"supersampling": times, "vignetting": None, "center": []}
     for name, more in of_parts.items():
         given |= more if parts in (name, "all") else {}
     moved = {name: v.to(device, dtype) if isinstance(v, torch.Tensor) else v for name, v in given.items()}
@@ -504,13 +507,15 @@ def test_gradients_of_a_picture_are_those_of_autograd(device, lens, parts, colum
     arguments = parameters.arguments()
     shown = widened(arguments, given.get("filter_3d"))
     exposure = given["exposure"] if given["exposure"] is None else given["exposure"].clone().requires_grad_()
+    vignetting = None if given["vignetting"] is None else given["vignetting"].clone().requires_grad_()
     how = {"times": times, "exposure": exposure, "mask": given["mask"], "ssim_weight": given["ssim_weight"]}
+    how |= {"vignetting": vignetting, "center": given["center"]}
     if "depth_target" in given:
         how["depth"] = {name: value for name, value in given.items() if name.startswith("depth_")}
     settings = settings_of(lens, device)._replace(bg=given["bg"])
     expected, image, expected_radii = compared(settings, shown, means2D, given["target"], **how)
     expected = expected + weights[0] * arguments["opacities"].mean() + weights[1] * arguments["scales"].mean()
-    wanted = [*parameters, *([means2D] if columns else []), *([] if exposure is None else [exposure])]
+    wanted = [*parameters, *([means2D] if columns else []), *(t for t in (exposure, vignetting) if t is not None)]
     made = torch.autograd.grad(expected, wanted, given["dL_dloss"])
     torch.testing.assert_close(picture, image.detach(), rtol=0, atol=1e-6)
     assert torch.equal(radii, expected_radii)
@@ -568,7 +573,7 @@ def test_picture_gradients_of_devices_and_precisions_agree(device, lens, parts):
         arguments = picture_arguments(where, parts, LENSES[lens], dtype)
         loss, image, _, gradients = torch.ops.analytic_rasterizer.picture_gradients(**arguments)
         results.append([t.double().cpu() for t in (loss, image, *gradients)])
-    assert len(results[0]) == 8 + (parts in ("exposure", "all"))
+    assert len(results[0]) == 8 + (parts in ("exposure", "vignetting")) + 2 * (parts == "all")
     for number, (expected, found) in enumerate(zip(*results)):
         assert expected.norm() > 0 and (found - expected).norm() < TOLERANCE * expected.norm(), number
 
@@ -598,6 +603,18 @@ def test_threads_change_no_bit_of_the_regularizers():
         ({"mask": torch.zeros(5, 5)}, ValueError, r"mask must have shape \(.*\), got \(5, 5\)"),
         ({"mask": torch.zeros(5, 5, dtype=torch.uint8)}, TypeError, "mask must have the dtype of means"),
         ({"exposure": torch.zeros(4, 3)}, ValueError, r"exposure must have shape \(3, 4\), got \(4, 3\)"),
+        ({"vignetting": torch.zeros(2)}, ValueError, "center must have two numbers with vignetting, and none .* got 0"),
+        ({"center": [1.0, 2.0]}, ValueError, "center must have two numbers with vignetting, and none without, got 2"),
+        (
+            {"vignetting": torch.zeros(3), "center": [1.0, 2.0]},
+            ValueError,
+            r"vignetting must have shape \(2,\), got \(3,\)",
+        ),
+        (
+            {"vignetting": torch.zeros(2), "center": [1.0, math.inf]},
+            ValueError,
+            "center must be finite, got 1 and inf",
+        ),
         ({"filter_3d": torch.zeros(11)}, ValueError, r"filter_3d must have shape \(N,\) with N = 12, got \(11,\)"),
         ({"filter_3d": torch.zeros(12).double()}, TypeError, "filter_3d must have the dtype of means"),
         ({"supersampling": 3}, ValueError, "supersampling must be at least 1 and divide .*, 32 and 32, got 3"),

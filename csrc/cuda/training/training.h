@@ -28,7 +28,7 @@ template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStrea
 /// Fewer than 2^31 for the largest image.
 int64_t correct_blocks(int64_t pixels);
 template <typename T> void correct_colors(const CorrectParams<T>& p, cudaStream_t stream);
-/// block_sums: [correct_blocks, kCorrection], scratch for dL_dmatrix.
+/// block_sums: [correct_blocks, kCorrection + kVignetting], scratch for the sums.
 template <typename T> void correct_colors_vjp(const CorrectVjpParams<T>& p, T* block_sums, cudaStream_t stream);
 
 template <typename T> void apply_filter(const FilterParams<T>& p, cudaStream_t stream);
