@@ -34,8 +34,8 @@ class Falloffs:
         views: Of the photographs.
 
     Attributes:
-        cameras: Places of the photographs of each of the C cameras.
-        camera: By photograph, the place of its camera; None: a sphere has no radius.
+        cameras: Indices of the photographs of each of the C cameras.
+        camera: By photograph, the index of its camera; None: a sphere has no radius.
         coefficients: (C, 2) float32, k2 and k4.
     """
 
