@@ -108,25 +108,27 @@ AR_HD void correct_color(const CorrectParams<T>& p, const Correction<T>& correct
 /// Adds what the pixel has of dL_dmatrix, and after it of dL_dvignetting.
 template <bool kVignetted, typename T>
 AR_HD void correct_color_vjp(const CorrectVjpParams<T>& p, const Correction<T>& correction, int64_t i, T* sums) {
-  const Vec3<T> shown = color_at(p.image, p.pixels, i), g = color_at(p.dL_dcorrected, p.pixels, i);
+  const Vec3<T> c = color_at(p.image, p.pixels, i), g = color_at(p.dL_dcorrected, p.pixels, i);
+  const T of_rows[3] = {g.x, g.y, g.z}, shown[3] = {c.x, c.y, c.z};
+  T colors[4] = {c.x, c.y, c.z, T(1)}, factor = T(1), dL_dfactor = T(0);
+  if constexpr (kVignetted) {
+    factor = Falloff<T>(p.vignetting, p.radii, i).factor;
+    for (int k = 0; k < 3; ++k) colors[k] *= factor;
+  }
+  for (int k = 0; k < kCorrection; ++k) sums[k] += of_rows[k / 4] * colors[k % 4];
   const auto& rows = correction.rows;
-  Vec3<T> c = shown;
+  for (int k = 0; k < 3; ++k) {
+    T dL_dcolor = rows[0][k] * g.x + rows[1][k] * g.y + rows[2][k] * g.z;
+    if constexpr (kVignetted) {
+      dL_dfactor += dL_dcolor * shown[k];
+      dL_dcolor *= factor;
+    }
+    if (p.dL_dimage) p.dL_dimage[k * p.pixels + i] = dL_dcolor;
+  }
   if constexpr (kVignetted) {
     const Falloff<T> falloff(p.vignetting, p.radii, i);
-    c = falloff.factor * shown;
-    const T colors[3] = {shown.x, shown.y, shown.z};
-    T dL_dfactor = T(0);
-    for (int k = 0; k < 3; ++k) {
-      const T dL_dc = rows[0][k] * g.x + rows[1][k] * g.y + rows[2][k] * g.z;
-      dL_dfactor += dL_dc * colors[k];
-      if (p.dL_dimage) p.dL_dimage[k * p.pixels + i] = falloff.factor * dL_dc;
-    }
     for (int j = 0; j < kVignetting; ++j) sums[kCorrection + j] += dL_dfactor * falloff.terms[j];
   }
-  const T of_rows[3] = {g.x, g.y, g.z}, colors[4] = {c.x, c.y, c.z, T(1)};
-  for (int k = 0; k < kCorrection; ++k) sums[k] += of_rows[k / 4] * colors[k % 4];
-  if (kVignetted || !p.dL_dimage) return;
-  for (int k = 0; k < 3; ++k) p.dL_dimage[k * p.pixels + i] = rows[0][k] * g.x + rows[1][k] * g.y + rows[2][k] * g.z;
 }
 
 }  // namespace ar
