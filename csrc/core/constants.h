@@ -8,6 +8,8 @@ namespace ar {
 inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
 /// On CUDA where samples move: see moving_grid().
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
+/// On CUDA in the order along rays.
+inline constexpr int kRayTileBits = 3;
 /// An image with fewer such tiles is small.
 inline constexpr int kSmallImageTiles = 4096;
 /// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid()).

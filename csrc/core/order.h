@@ -27,6 +27,12 @@ template <typename T> struct RayDepth {
   Vec2<T> slope;  ///< [world units / px]
 };
 
+/// Of splats, and the size of the window; 0: the order of centres.
+template <typename T> struct RayOrder {
+  const RayDepth<T>* depths;  ///< [splats]
+  int window;
+};
+
 /// d: pixel - mean [px]. The same bits in tiles of all sizes.
 template <typename T, class V> AR_HD V depth_in_pixel(const RayDepth<T>& of, Vec2<V> d) {
   return madd(V(of.slope.x), d.x, madd(V(of.slope.y), d.y, V(of.depth)));

@@ -51,6 +51,8 @@ AR_HD TileGrid moving_grid(int samples, int width, int height) {
   return {width, height, moving_tile_bits(samples, is_small_image({width, height}))};
 }
 
+AR_HD TileGrid ray_grid(int width, int height) { return {width, height, kRayTileBits}; }
+
 template <typename T> struct CameraView {
   const T* view;      ///< [16] world to camera, transposed
   const T* proj;      ///< [16] world to clip space, transposed

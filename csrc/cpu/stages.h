@@ -78,12 +78,6 @@ struct TileLists {
   const int64_t* tile_offsets;
 };
 
-/// For blend_rays and blend_rays_vjp.
-template <typename T> struct RayOrder {
-  const RayDepth<T>* depths;  ///< [splats].
-  int window;                 ///< Slots.
-};
-
 template <typename T> struct BlendParams : ar::BlendParams<T> {
   TileLists lists;
   int threads;

@@ -1,5 +1,5 @@
 // The backward pass of CUDA, stage by stage in the order of Backend (torch/backend.h): the adjoints of forward.cu,
-// called in the same way. `blend_vjp` is one of still/, moment/ and channels/, the kernels of the others are in
+// called in the same way. `blend_vjp` is one of still/, moment/, channels/ and rays/, the kernels of the others are in
 // project/project_vjp.cuh.
 #include <algorithm>
 #include <mutex>
@@ -57,10 +57,11 @@ void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
   launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
-  const Family family = family_at(footprint, p.channels.count);
+  const Family family = family_at(footprint, p.channels.count, p.order.window > 0);
   if (family == Family::kStill) blend_vjp_still(footprint, p, stream);
   if (family == Family::kMoment) blend_vjp_moment(footprint, p, first, stream);
   if (family == Family::kChannels) blend_vjp_channels(footprint, p, first, stream);
+  if (family == Family::kRays) blend_vjp_rays(footprint, p, stream);
 }
 
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream) {

@@ -14,6 +14,7 @@
 //   moment 1                             any        16x16; 8x8 in small images      moment/
 //   moment 4                             any        8x8                             moment/
 //   moment 16                            any        8x8; 4x4 in small images        moment/
+//   kAlongRays, in that order            up to 4    8x8, a lane per pixel           rays/
 #pragma once
 
 #include <algorithm>
@@ -26,7 +27,7 @@
 
 namespace ar::cuda {
 
-enum class Family { kStill, kMoment, kChannels };
+enum class Family { kStill, kMoment, kChannels, kRays };
 
 /// log2 of the side of tiles [px].
 template <class F> constexpr int tile_bits_of(bool small_image) {
@@ -51,14 +52,22 @@ template <class Function> void visit_pixels(int footprint, Function&& f) {
   visit_footprint(footprint, Footprints{}, [&](auto chosen) { f(PixelsOf<decltype(chosen)>{}); });
 }
 
-template <class F> constexpr Family family_of(int64_t channels) {
+/// `rays`: in the order along rays.
+template <class F> constexpr Family family_of(int64_t channels, bool rays = false) {
+  if (rays) return Family::kRays;
   if (F::kMoves) return Family::kMoment;
   return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
 }
-inline Family family_at(int footprint, int64_t channels) {
+inline Family family_at(int footprint, int64_t channels, bool rays = false) {
   Family found = Family::kStill;
-  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
+  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels, rays); });
   return found;
+}
+/// Calls f(F{}) for a footprint F whose splats may be ordered along rays.
+template <class Function> void visit_along_rays(int footprint, Function&& f) {
+  visit_pixels(footprint, [&](auto chosen) {
+    if constexpr (decltype(chosen)::kAlongRays) f(chosen);
+  });
 }
 /// The same, if kFamily has kernels for it.
 template <Family kFamily, class Function> void visit_lanes(int footprint, TileGrid grid, Function&& f) {
@@ -94,13 +103,19 @@ struct Route {
 };
 
 /// `capacity`: room for pairs.
-inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGrid grid, int multiprocessors) {
+inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGrid grid, int multiprocessors,
+                      bool rays = false) {
   Route route = {};
   visit_pixels(footprint, [&](auto f) {
     using F = decltype(f);
-    route.family = family_of<F>(channels);
+    route.family = family_of<F>(channels, rays);
     route.samples = route.samples_of_lane = F::kSamples;
     route.cut = {route.family != Family::kStill};
+    if (rays) {
+      route.forward = {"blend_rays_kernel"};
+      route.backward = {"blend_rays_vjp_kernel"};
+      return;
+    }
     if constexpr (F::kMoves) {
       route.cut = moving_list_cut(F::kSamples, capacity, grid, multiprocessors);
       const bool cuts = route.cut.max_segments > 0;

@@ -3,7 +3,7 @@
 //
 //   project   Gaussians to splats, or to public rows     project/project.cuh
 //   bin       splats to a list for each tile, by depth   bin/bin.cuh, bin/sort.cuh
-//   blend     lists to images                            bin/plan.cuh, then one of still/, moment/ and channels/
+//   blend     lists to images                            bin/plan.cuh, then one of still/, moment/, channels/, rays/
 //   inspect   lists to statistics                        inspect.cuh
 #include <algorithm>
 
@@ -12,6 +12,7 @@
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/project/project.cuh"
+#include "cuda/project/rays.cuh"
 
 namespace ar::cuda {
 
@@ -21,8 +22,13 @@ void project(const ProjectParams& p, cudaStream_t stream) {
   launch_rows(project_kernel<Camera<float>>, project_kernel<FullCamera<float>>, p, stream,
               multiprocessors() * ProjectPolicy::kBlocksPerSm);
 }
+void ray_depths(const RayDepthsParams& p, cudaStream_t stream) {
+  launch_rows(ray_depths_kernel<Camera<float>>, ray_depths_kernel<FullCamera<float>>, p, stream);
+}
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
   launch_rows(project_rows_kernel<Camera<float>>, project_rows_kernel<FullCamera<float>>, p, stream);
+  if (!p.rows.slopes) return;
+  launch_rows(row_slopes_kernel<Camera<float>>, row_slopes_kernel<FullCamera<float>>, p, stream);
 }
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch_rows(shape_rows_kernel, p, p.n, stream); }
 
@@ -100,10 +106,11 @@ void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListC
 }
 
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
-  const Family family = family_at(footprint, p.channels.count);
+  const Family family = family_at(footprint, p.channels.count, p.order.window > 0);
   if (family == Family::kStill) blend_still(footprint, p, stream);
   if (family == Family::kMoment) blend_moment(footprint, p, stream);
   if (family == Family::kChannels) blend_channels(footprint, p, stream);
+  if (family == Family::kRays) blend_rays(footprint, p, stream);
 }
 
 // inspect

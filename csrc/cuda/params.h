@@ -10,6 +10,7 @@
 
 #include "core/bin.h"
 #include "core/camera.h"
+#include "core/order.h"
 #include "core/rows.h"
 #include "core/weight.h"
 #include "cuda/bin/chunk_plan.h"
@@ -95,6 +96,14 @@ struct ProjectRowsParams {
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float>, BinInput {};
 
+/// For the order along rays, after `project`.
+struct RayDepthsParams {
+  CameraView<float> camera;
+  Gaussians<float> gaussians;
+  const PairRange* ranges;  ///< [n]
+  RayDepth<float>* depths;  ///< [n] written where there are pairs
+};
+
 struct EmitParams {
   const float* splats;  ///< [n, kSplatWidth]
   int64_t n;
@@ -134,6 +143,7 @@ struct BlendParams : ar::BlendParams<float> {
   CheckpointLayout layout;  ///< still/
   float* checkpoints;       ///< still/: [planes, kTile^2]; moment/: [checkpoints, state_planes(), side^2]
   uint32_t* reach_words;    ///< [max_reach_words()] moment/, or null
+  RayOrder<float> order;
 };
 
 struct InspectParams : ar::InspectParams<float> {
@@ -141,6 +151,12 @@ struct InspectParams : ar::InspectParams<float> {
   // Instead of depths, where splats are Gaussians.
   CameraView<float> camera;
   const Vec3<float>* means;
+};
+
+/// rays/: what the lanes of a warp have composited, in rows that are logged again once there are more.
+struct RayLog {
+  uint32_t* words;  ///< [blocks, warps of a block, rows, words of a row, 32]
+  int blocks, rows;
 };
 
 /// Without channels.data dL_dimage.first is not null.
@@ -158,6 +174,8 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   MeanSums mean_sums;
   float* adjoint_maps;  ///< [max_adjoint_maps()] moment/
   float* group_sums;    ///< [max_group_sums()] moment/
+  RayOrder<float> order;
+  RayLog ray_log;  ///< rays/
 };
 
 struct PairSumsView {
@@ -210,6 +228,8 @@ AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 // The forward pass (forward.cu). `footprint`: index in the registry.
 
 void project(const ProjectParams& p, cudaStream_t stream);
+void ray_depths(const RayDepthsParams& p, cudaStream_t stream);
+/// Writes rows.slopes too, if there are any.
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
 
@@ -276,6 +296,8 @@ void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
 /// `begun`: as in LaunchShape.
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
 int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid);
+/// Blocks and rows, and the words of all.
+RayLog ray_log(int footprint, TileGrid grid, int64_t& words);
 /// The group of channels from `first` on.
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
@@ -290,9 +312,11 @@ void row_grads(const RowGradsParams& p, cudaStream_t stream);
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_channels(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_rays(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);
 void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
+void blend_vjp_rays(int footprint, const BlendVjpParams& p, cudaStream_t stream);
 
 // Weights of a footprint (weight.cu).
 

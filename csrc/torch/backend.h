@@ -12,6 +12,7 @@
 #include <string_view>
 #include <vector>
 
+#include "core/order.h"
 #include "core/stages.h"
 #include "torch/arguments.h"
 #include "torch/images.h"
@@ -26,6 +27,7 @@ struct SplatTensors {
   // CUDA:
   Tensor counts;  ///< Counts, zero.
   Tensor ranges;  ///< (n, kRangeWidth) PairRange.
+  Tensor rays;    ///< (n, kRayWidth) RayDepth, in the order along rays.
   Tensor memory;  ///< SplatMemory (cuda_views.h).
 };
 
@@ -197,11 +199,15 @@ struct Pass {
   Pass(const Arguments& a, const Tensor& like)
       : footprint(find_footprint(a.footprint, a.option)),
         grid(grid_of(footprint, a.image_width, a.image_height, like.is_cuda())),
-        exact(at::globalContext().deterministicAlgorithms()) {
-    TORCH_CHECK_NOT_IMPLEMENTED(!footprint.along_rays() || !like.is_cuda(),
-                                "order 'ray' cannot be rendered on CUDA yet: render on the CPU, or in order 'center'");
-  }
+        exact(at::globalContext().deterministicAlgorithms()) {}
 };
+
+/// For `blend` and blend_vjp. Raises if there are more channels than this order can blend.
+template <typename T> RayOrder<T> ray_order_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
+  TORCH_CHECK_VALUE(!pass.footprint.along_rays() || channels <= kMaxRayChannels, "order 'ray' can blend at most ",
+                    kMaxRayChannels, " channels, got ", channels);
+  return {const_pointer<RayDepth<T>>(lists.rays), pass.footprint.window};
+}
 
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
   if (!pass.keep) return {};

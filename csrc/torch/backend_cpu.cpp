@@ -178,7 +178,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.threads = thread_count();
     const Tensor scratch = make_scratch(p.threads, channels.count);
     p.scratch = pointer<T>(scratch);
-    p.order = ray_order_of(lists, pass, channels);
+    p.order = ray_order_of<T>(lists, pass, channels.count);
     cpu::blend(pass.footprint.choice.index, p);
   }
 
@@ -211,7 +211,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.mean_sums = mean_sums;
     p.pair_means = pointer<Vec2<T>>(out.means);
     const int footprint = pass.footprint.choice.index;
-    p.order = ray_order_of(lists, pass, channels);
+    p.order = ray_order_of<T>(lists, pass, channels.count);
     const bool replays = pass.footprint.moves && !pass.footprint.along_rays();
     const Tensor replay = at::empty({replays ? p.threads : 0, cpu::kReplayNumbers}, floats_);
     p.replay = pointer<T>(replay);
@@ -295,12 +295,6 @@ template <typename T> class CpuBackend final : public Backend {
 
  private:
   using Clock = std::chrono::steady_clock;
-
-  static cpu::RayOrder<T> ray_order_of(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels) {
-    TORCH_CHECK_VALUE(!pass.footprint.along_rays() || channels.count <= kMaxRayChannels,
-                      "order 'ray' can blend at most ", kMaxRayChannels, " channels, got ", channels.count);
-    return {const_pointer<RayDepth<T>>(lists.rays), pass.footprint.window};
-  }
 
   template <class Params> static void set_pair_sums(Params& p, const ListTensors& lists, const PairSums& sums) {
     p.pairs = splat_pairs_of(lists);

@@ -1,6 +1,7 @@
 // Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. The host waits only to count
 // pairs (counting_of(), pair_guess.h), to time stages, for tiles_share_lists(), and with debug.
 #include <ATen/Dispatch.h>
+#include <ATen/ops/cat.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
@@ -46,6 +47,12 @@ class CudaBackend final : public Backend {
     set_for_bin(p, out);
     cuda::project(p, stream_);
     check_stage("project", false);
+    if (pass.footprint.along_rays()) {
+      out.rays = at::empty({in.count(), ListTensors::kRayWidth}, floats_);
+      cuda::RayDepthsParams rays = {p.camera, p.gaussians, p.ranges, pointer<RayDepth<float>>(out.rays)};
+      cuda::ray_depths(rays, stream_);
+      check_stage("ray_depths", false);
+    }
     return out;
   }
 
@@ -76,6 +83,7 @@ class CudaBackend final : public Backend {
     set_for_bin(p, out);
     cuda::shape_rows(p, stream_);
     check_stage("shape_rows", false);
+    if (pass.footprint.along_rays()) out.rays = at::cat({rows.depths.unsqueeze(1), rows.slopes}, 1);
     return out;
   }
 
@@ -106,7 +114,7 @@ class CudaBackend final : public Backend {
     out.ids = at::empty({n}, ints_);
     out.positions = at::empty({0}, longs_);
     out.counts = splats.counts;
-    out.rays = at::empty({0}, floats_);
+    out.rays = splats.rays.defined() ? splats.rays : at::empty({0}, floats_);
     auto* counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
     cuda::DepthSort by_depth = {};
     by_depth.n = n;
@@ -160,6 +168,7 @@ class CudaBackend final : public Backend {
              BlendState& state) override {
     check_counts(lists);
     cuda::BlendParams p = {};
+    p.order = ray_order_of<float>(lists, pass, channels.count);
     set_blend<float>(p, lists, pass, channels, image, state);
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
@@ -208,6 +217,7 @@ class CudaBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
+    const RayOrder<float> order = ray_order_of<float>(lists, pass, channels.count);
     const cuda::ListCut cut = route_of(lists, pass, channels.count).cut;
     check_plan(state, cut, pass.grid);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
@@ -237,6 +247,14 @@ class CudaBackend final : public Backend {
     const int64_t sums = cuda::max_group_sums(pass.footprint.choice.index, p.channels, cut, pass.grid);
     if (sums > 0) group_sums = at::empty({sums}, floats_);
     p.group_sums = pointer<float>(group_sums);
+    p.order = order;
+    Tensor ray_log;
+    if (pass.footprint.along_rays()) {
+      int64_t words = 0;
+      p.ray_log = cuda::ray_log(pass.footprint.choice.index, pass.grid, words);
+      ray_log = at::empty({words}, ints_);
+      p.ray_log.words = structs_of<uint32_t>(ray_log);
+    }
 
     cuda::SumChannelsParams sum = {};
     sum.sums = pair_sums_of(lists, out.pairs);

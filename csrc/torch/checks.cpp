@@ -139,6 +139,7 @@ void refuse_rays(const Pass& pass, const char* what) {
 }
 
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
+  if (cuda && footprint.along_rays()) return ray_grid(int(width), int(height));
   if (cuda && footprint.moves) return moving_grid(footprint.samples, int(width), int(height));
   if (cuda) return spread_grid(footprint.lanes, int(width), int(height));
   return {int(width), int(height)};

@@ -159,7 +159,7 @@ inline void check_counts(const ListTensors& lists) {
 /// The same for `blend` and `blend_vjp`.
 inline cuda::Route route_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
   return cuda::route_of(pass.footprint.choice.index, channels, lists.pairs.size(0), pass.grid,
-                        cuda::multiprocessors_of_device());
+                        cuda::multiprocessors_of_device(), pass.footprint.along_rays());
 }
 inline int64_t max_chunks(const Tensor& chunks, const cuda::ListCut& cut) {
   return chunks.size(0) - kPlanRows - cut.max_lists;

@@ -54,8 +54,8 @@ std::pair<std::vector<std::string>, std::vector<std::string>> blend_route(const 
                                                                           int64_t capacity) {
   const FootprintSpec footprint = find_footprint(key, 0);
   const TileGrid grid = grid_of(footprint, width, height, true);
-  const cuda::Route route =
-      cuda::route_of(footprint.choice.index, channels, capacity, grid, cuda::multiprocessors_of_device());
+  const cuda::Route route = cuda::route_of(footprint.choice.index, channels, capacity, grid,
+                                           cuda::multiprocessors_of_device(), footprint.along_rays());
   const auto named = [](const auto& names) {
     std::vector<std::string> out;
     for (const char* name : names) {

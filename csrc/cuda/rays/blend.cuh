@@ -1,0 +1,49 @@
+// Kernel blend_rays: the forward pass in the order along rays, for up to four channels. A block per tile.
+#pragma once
+
+#include "cuda/rays/walk.cuh"
+#include "cuda/still/output.cuh"
+
+namespace ar::cuda {
+
+/// C: 3 channels in the splats, or up to 4 in rows. With a backward pass `last` gets numbers of composited splats.
+template <class F, int C>
+__global__ void __launch_bounds__(kRayThreads, blocks_per_sm(RayPolicy::kBlocks<F>, kRayThreads))
+    blend_rays_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
+  constexpr int S = F::kSamples, kAtOnce = RayPolicy::kAtOnce<F>;
+  auto& stage = *reinterpret_cast<RayStage<F>*>(dynamic_shared());
+  auto* const memory = reinterpret_cast<float*>(&stage + 1);
+  const TileList list = list_of(params.lists, params.grid, params.plan.tile_order[blockIdx.x]);
+  const Vec2<float> p = RayBoxes::pixel();
+  const Pixel pixel(list, params.grid, p);
+  RaySamples<F> samples(pixel.inside);
+  Values<C> sums = {};
+  int last[S] = {};
+  walk_rays<F>(
+      params, list, stage, memory, p, pixel.inside, [](int, int32_t id) { return id; },
+      [&](const RayEntry(&entries)[kAtOnce]) {
+        Values<C> channels[kAtOnce];
+        LeavingSplat<F> leaving[kAtOnce] = {};
+        AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
+          const int32_t id = max(entries[i].payload, 0);  // any splat, for lanes that have none
+          const Splat<F, float> splat = load_splat<F>(params.splats, id);
+          channels[i] = channels_of<C>(params.channels, splat, id);
+          leaving[i].set(splat, list, p);
+        }
+        AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
+          add_samples<S>(sums, channels[i], [&](int s) {
+            const Blended<float> b = blend_leaving(leaving[i], entries[i], p, s, samples);
+            last[s] += b.mask;
+            return b;
+          });
+        }
+        return samples.open();
+      });
+  AR_UNROLL for (int s = 0; s < S; ++s) {
+    if (params.last && pixel.inside) params.last[s * pixel.image + pixel.index] = last[s];
+  }
+  store_pixel<LaneSamples<S, 1>>(params, pixel, sums, samples.transmittance);
+}
+
+}  // namespace ar::cuda
