@@ -222,6 +222,7 @@ ROWS = {
     "lens:perspective": (EffectCase.plain, lens(ar.Lens.perspective((-0.1, 0.02), (1e-3, 1e-3)))),
     "lens:fisheye": (EffectCase.plain, lens(ar.Lens.fisheye((0.02,)))),
     "near_far": (EffectCase.plain, EffectCase.near_far),
+    "order": (EffectCase.plain, effect(order="ray")),
     "filter_3d": (EffectCase.plain, EffectCase.filter_3d),
     "defocus": (EffectCase.plain, EffectCase.defocus),
     "motion": (EffectCase.plain, EffectCase.motion),

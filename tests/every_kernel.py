@@ -31,6 +31,7 @@ from analytic_rasterizer.activations import activate
 from analytic_rasterizer.dialects.gsplat import rasterization
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.optim import FusedAdam
+from analytic_rasterizer.render.order import footprints_along_rays
 
 sys.path[:0] = [str(Path(__file__).parent / folder) for folder in ("makers", "distributed")]
 
@@ -213,6 +214,22 @@ def effects(device: str) -> None:
         render(device, footprint="moment:samples=4", effects=each)
 
 
+def rays(device: str) -> None:
+    """The order along rays, with a pinhole and a lens, three channels in splats and in rows, and by stages."""
+    for footprint in footprints_along_rays():
+        for effects in (
+            ar.Effects(order="ray"),
+            ar.Effects(order="ray", depth=True, lens=ar.Lens.fisheye([0.05])),
+        ):
+            render(device, images=("small", "small, opaque", "pixel"), footprint=footprint, effects=effects)
+    image = IMAGES["small"]
+    for effects in (ar.Effects(order="ray"), ar.Effects(order="ray", lens=ar.Lens.fisheye([0.05]))):
+        settings = image.camera().settings(torch.float32, device, footprint="box:samples=1", effects=effects)
+        leaves = scenes.without(scenes.leaves(image.scene(device)), "means2D")
+        splats = ar.project(settings._replace(sh_degree=3), **leaves)
+        ar.blend(splats, ar.list_tiles(splats))[0].sum().backward()
+
+
 def cameras(device: str) -> None:
     """Prepared and differentiated, with limits of lenses found on the device."""
     ops = torch.ops.analytic_rasterizer
@@ -275,7 +292,7 @@ def training(device: str) -> None:
 PARTS = {scenes.name_of(variant): partial(footprint, footprint=variant[0], **variant[1]) for variant in scenes.VARIANTS}
 PARTS |= {"largest": partial(footprint, images=("large", "largest"), footprint="box:samples=4")}
 PARTS |= {"channels": many_channels, "pairs": too_many_pairs, "sorts": sorts, "stages": stages, "weights": weights}
-PARTS |= {"cameras": cameras, "effects": effects, "gsplat": gsplat, "losses": losses, "rows": rows}
+PARTS |= {"cameras": cameras, "effects": effects, "gsplat": gsplat, "losses": losses, "rays": rays, "rows": rows}
 PARTS |= {"steps": steps, "training": training}
 
 

@@ -288,7 +288,7 @@ def _effect_costs(scene: Gaussians, cameras, footprint, effects: Effects, shown,
     if effects.filter_3d is not None:
         cases["no filter"] = (scene, footprint, replace(effects, filter_3d=None))
         with_and_without["filter_3d"] = ("plain", "no filter")
-    if _has_rays(cameras[0]):
+    if not has_seam(cameras[0]):
         cases["rays"], cases["centers"] = ((scene, BASE, replace(effects, order=o)) for o in (RAY, CENTER))
         with_and_without["order"] = ("rays", "centers")
     seconds = _seconds(cases, cameras, rounds)
@@ -344,14 +344,9 @@ def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float)
     return EffectFinding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
-def _has_rays(camera: GaussianRasterizationSettings) -> bool:
-    """Whether a view can be rendered in the order along rays."""
-    return camera.viewmatrix.device.type == "cpu" and not has_seam(camera)
-
-
 def _order_difference(scene: Gaussians, cameras: list, effects: Effects) -> OrderDifference | None:
     """How far BASE in the order of centres is from BASE along rays; None where that cannot be rendered."""
-    if not all(_has_rays(camera) for camera in cameras):
+    if any(has_seam(camera) for camera in cameras):
         return None
     in_orders = [replace(effects, order=order) for order in (CENTER, RAY)]
     return OrderDifference.of([[_stages(scene, camera, BASE, e).color for e in in_orders] for camera in cameras])
@@ -359,7 +354,7 @@ def _order_difference(scene: Gaussians, cameras: list, effects: Effects) -> Orde
 
 def _order_finding(found: OrderDifference | None, tolerance: float, cost: float | None) -> EffectFinding:
     if found is None:
-        reason = "not examined: the order along rays is for the CPU, and for other pictures than equirectangular ones"
+        reason = "not examined: the order along rays is for other pictures than equirectangular ones"
         return EffectFinding("order", None, None, None, None, CENTER, reason)
     needed = found.rms > tolerance
     reason = (

@@ -61,9 +61,9 @@ def test_inspect_says_whether_the_order_matters(angle, needed):
 
 def test_inspect_where_the_order_cannot_be_rendered():
     """A lens of the whole sphere."""
-    settings = CAMERA.settings(torch.float32)
-    from analytic_rasterizer.analysis.planner import _has_rays
+    from analytic_rasterizer.analysis.planner import _order_difference, _order_finding
 
-    assert _has_rays(settings)
     sphere = ar.Effects(lens=ar.Lens.equirectangular())
-    assert not _has_rays(settings._replace(effects=sphere))
+    settings = CAMERA.settings(torch.float32)._replace(effects=sphere)
+    assert _order_difference(plates(0.0), [settings], sphere) is None
+    assert _order_finding(None, 1 / 255, None).needed is None

@@ -18,13 +18,13 @@ RAYS = ar.Effects(order=RAY)
 SMALL = Camera(image_height=19, image_width=23)
 
 
-def crossed(seed=3, count=60):
+def crossed(device="cpu", seed=3, count=60):
     """Gaussians through each other, float32."""
     scene = scenes.random_scene(seed, count)
     generator = torch.Generator().manual_seed(seed)
     flat = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     scene["scales"] = torch.where(flat < 0.3, 0.05, 0.6) * (0.5 + flat)
-    return scenes.cast(scene, torch.float32)
+    return scenes.cast(scene, torch.float32, device)
 
 
 def test_names():
@@ -60,13 +60,13 @@ def test_footprints():
             SMALL.render(scene, footprint=footprint, effects=RAYS)
 
 
-def test_the_op_refuses_by_name():
+def test_the_op_refuses_by_name(device):
     """Whoever calls the operators with keys of their own."""
-    scene = crossed()
+    scene = crossed(device)
     optional = dict.fromkeys(("means2D", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp"))
     from analytic_rasterizer.render.arguments import camera_arguments, gaussian_arguments
 
-    settings = SMALL.settings(torch.float32, footprint="point")
+    settings = SMALL.settings(torch.float32, device, footprint="point")
     arguments = gaussian_arguments(settings, **(optional | scene)) | {"bg": settings.bg}
     camera = camera_arguments(settings, scene["means3D"], scene["shs"])
     for key, message in (
@@ -83,9 +83,9 @@ def test_the_op_refuses_by_name():
         )
 
 
-def test_channels():
+def test_channels(device):
     """Up to four, of which depth is one; more are refused by name."""
-    scene = crossed()
+    scene = crossed(device)
     effects = ar.Effects(order=RAY, alpha=True, depth=True)
     color, _, outputs = SMALL.render(scene, footprint="box:samples=1", effects=effects)
     assert torch.equal(color, SMALL.render(scene, footprint="box:samples=1", effects=RAYS)[0])
@@ -94,7 +94,7 @@ def test_channels():
         SMALL.render(scene, footprint="point", effects=ar.Effects(order=RAY, depth=True, inverse_depth=True))
     for count in (1, 2, 4):
         features = dict(scene, shs=None, colors_precomp=scene["shs"][:, 0, :1].expand(-1, count).contiguous())
-        fields = SMALL.fields(torch.float32) | {"bg": torch.zeros(count)}
+        fields = SMALL.fields(torch.float32, device) | {"bg": torch.zeros(count, device=device)}
         settings = ar.GaussianRasterizationSettings(**fields, footprint="point", effects=RAYS)
         leaves = scenes.leaves({name: value for name, value in features.items() if value is not None})
         image = ar.GaussianRasterizer(settings)(**leaves)[0]
@@ -106,11 +106,11 @@ def test_channels():
 
 
 @pytest.mark.parametrize("footprint", ["box:samples=1", "moment:samples=4"])
-def test_stages(footprint):
+def test_stages(device, footprint):
     """project, list_tiles and blend, one and several cameras, give what the rasterizer does, and its gradients."""
-    scene = crossed()
+    scene = crossed(device)
     cameras = [SMALL, Camera(image_height=19, image_width=23, eye=(-3.0, 1.5, -3.0))]
-    settings = [camera.settings(torch.float32, footprint=footprint, effects=RAYS) for camera in cameras]
+    settings = [camera.settings(torch.float32, device, footprint=footprint, effects=RAYS) for camera in cameras]
     leaves = scenes.leaves({name: value for name, value in scene.items() if name != "means2D"})
     splats = ar.project(settings, **leaves)
     assert splats.slopes.shape == (len(splats.means2d), 2)
@@ -131,9 +131,9 @@ def test_stages(footprint):
         ar.list_tiles(replace(splats, slopes=None))
 
 
-def test_gsplat():
+def test_gsplat(device):
     """The call, packed and as a table, gives what the rasterizer does."""
-    scene = crossed()
+    scene = crossed(device)
     view = SMALL.world_to_camera().float()[None]
     focal = SMALL.image_width / (2 * SMALL.tanfovx), SMALL.image_height / (2 * SMALL.tanfovy)
     intrinsics = torch.tensor([[[focal[0], 0, 11.5], [0, focal[1], 9.5], [0, 0, 1]]])
@@ -144,8 +144,8 @@ def test_gsplat():
         "opacities": scene["opacities"][:, 0],
         "colors": scene["shs"],
         "sh_degree": 0,
-        "viewmats": view,
-        "Ks": intrinsics,
+        "viewmats": view.to(device),
+        "Ks": intrinsics.to(device),
         "width": SMALL.image_width,
         "height": SMALL.image_height,
         "near_plane": 0.2,
@@ -162,10 +162,10 @@ def test_gsplat():
         rasterization(**given, order=RAY, distributed=True)
 
 
-def test_opcheck():
+def test_opcheck(device):
     """Fake kernels know the rows and lists of the order."""
-    scene = crossed(count=20)
-    settings = SMALL.settings(torch.float32, footprint="moment:samples=4", effects=RAYS)
+    scene = crossed(device, count=20)
+    settings = SMALL.settings(torch.float32, device, footprint="moment:samples=4", effects=RAYS)
     gaussians = {name: value for name, value in scene.items() if name != "means2D"}
     compiled = torch.compile(
         lambda **tensors: ar.GaussianRasterizer(settings)(means2D=None, **tensors)[0], backend="eager", fullgraph=True

@@ -59,10 +59,10 @@ def test_kernels_begin_by_waiting():
     assert [name for name, lines in begins.items() if lines[0] != wait or let_begin in lines] == []
 
 
-def test_the_table_of_dispatch_names_the_kernels_of_the_three_families():
+def test_the_table_of_dispatch_names_the_kernels_of_the_four_families():
     """Route::forward and Route::backward of csrc/cuda/dispatch.h; tests/cpp/cuda_on_host/dispatch_test.cpp tests the
     rest of the table."""
     table = (ROOT / "csrc" / "cuda" / "dispatch.h").read_text()
     named = re.findall(r'"(\w+)_kernel"', table)
     assert len(named) > 10
-    assert set(named) == {name for family in ("still", "moment", "channels") for name, _ in kernels_of(family)}
+    assert set(named) == {name for family in ("still", "moment", "channels", "rays") for name, _ in kernels_of(family)}

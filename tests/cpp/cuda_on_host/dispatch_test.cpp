@@ -61,6 +61,25 @@ const char* first_kernel(Family family, bool cuts, bool forward) {
   return forward ? "moving_blend_kernel" : "moving_vjp_kernel";
 }
 
+TEST(Dispatch, HasOneFamilyAlongRays) {
+  for_each_footprint(Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if (!F::kAlongRays) return;
+    const int index = find_footprint(key_of<F>());
+    for (const auto& [width, height] : kSizes) {
+      const TileGrid grid = ray_grid(width, height);
+      EXPECT_EQ(grid.side(), 8);
+      const Route route = route_of(index, 3, 1000000, grid, cuda_on_host::kMultiprocessors, true);
+      EXPECT_EQ(route.family, Family::kRays);
+      EXPECT_EQ(route.samples_of_lane, F::kSamples);
+      EXPECT_TRUE(route.cut.whole);
+      EXPECT_EQ(route.cut.max_segments, 0);
+      EXPECT_STREQ(route.forward[0], "blend_rays_kernel");
+      EXPECT_STREQ(route.backward[0], "blend_rays_vjp_kernel");
+    }
+  });
+}
+
 TEST(Dispatch, IsWhatItsTableSays) {
   constexpr int kMultiprocessors = cuda_on_host::kMultiprocessors;
   int footprint = 0;
