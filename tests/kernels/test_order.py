@@ -66,7 +66,10 @@ def tilted_scene(seed, count=60):
 def both(camera, scene, variant, dtype, window, device="cpu", effects=RAYS):
     """The library's image, the reference's, its RayOrder, the pixels that rounding cannot change, and the leaves."""
     rounded = scenes.cast(scene, dtype)
-    ours, theirs = scenes.leaves(scenes.cast(rounded, dtype, device)), scenes.leaves(scenes.cast(rounded, torch.float64))
+    ours, theirs = (
+        scenes.leaves(scenes.cast(rounded, dtype, device)),
+        scenes.leaves(scenes.cast(rounded, torch.float64)),
+    )
     settings = exact_settings(camera, dtype, variant)._replace(effects=effects)
     color = camera.render(ours, variant, effects=effects)[0].cpu()
     footprint, options = variant
@@ -287,7 +290,9 @@ def test_slopes_on_cuda():
     scene = scenes.without(scenes.cast(tilted_scene(3), torch.float32), "means2D")
     for effects in (RAYS, ar.Effects(order=RAY, lens=ar.Lens.fisheye([0.05]))):
         made = [
-            ar.project(SMALL.settings(torch.float32, device, ("point", {}), effects=effects), **scenes.to(scene, device))
+            ar.project(
+                SMALL.settings(torch.float32, device, ("point", {}), effects=effects), **scenes.to(scene, device)
+            )
             for device in ("cpu", "cuda")
         ]
         assert torch.equal(made[0].gaussian_ids, made[1].gaussian_ids.cpu())

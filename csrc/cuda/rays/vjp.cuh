@@ -13,8 +13,7 @@ namespace ar::cuda {
 
 /// In a row of the log a lane has its place in the list (-1: nothing was composited), and where its samples were, or
 /// the opacity * weight of its one sample.
-template <class F>
-inline constexpr int kLogWords = 1 + (F::kMoves ? 2 * F::kSamples : kKeepsRaw<F> ? 1 : 0);
+template <class F> inline constexpr int kLogWords = 1 + (F::kMoves ? 2 * F::kSamples : kKeepsRaw<F> ? 1 : 0);
 
 /// Values of PairGrad and C channels.
 template <int C> inline constexpr int kRaySums = kPairChannels + C;
@@ -26,8 +25,8 @@ template <class F, int C> struct RayVjpShared {
   int chunk;
 };
 
-/// Adds to rows of pair_grads what lanes have for them: value k to column(k). A lane with row -1 has nothing. `of_lanes`
-/// has room for 32 (kCount | 1) numbers.
+/// Adds to rows of pair_grads what lanes have for them: value k to column(k). A lane with row -1 has nothing.
+/// `of_lanes` has room for 32 (kCount | 1) numbers.
 template <int kCount, class Column>
 __device__ void add_to_rows(float* of_lanes, const float (&values)[kCount], int32_t row, float* pair_grads,
                             Column&& column) {
@@ -180,8 +179,8 @@ template <class F, int C> class RayWalkBack {
     } else {
       AR_UNROLL for (int s = 0; s < S; ++s) {
         const float raw = kKeepsRaw<F> ? event.entry.raw : F::alpha(terms, p_, s);
-        const BlendGrad<float> grad = blend_sample_vjp(composited(raw, row, to.stopped[s]), raw, g_color,
-                                                       to.transmittance[s], to.behind[s]);
+        const BlendGrad<float> grad =
+            blend_sample_vjp(composited(raw, row, to.stopped[s]), raw, g_color, to.transmittance[s], to.behind[s]);
         F::add_alpha_vjp(terms, p_, s, grad.of_alpha, shape);
         contribution += grad.contribution;
         weighted += grad.of_alpha.weighted;

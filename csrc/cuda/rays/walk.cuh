@@ -150,7 +150,7 @@ template <class F> class RayWindow {
 /// Of a pixel, all in a lane.
 template <class F> struct RaySamples {
   static constexpr int S = F::kSamples;
-  float transmittance[S];               ///< negative: the sample has stopped
+  float transmittance[S];                 ///< negative: the sample has stopped
   Vec2<float> places[F::kMoves ? S : 1];  ///< of samples that move, from the pixel's centre [px]
 
   __device__ explicit RaySamples(bool inside) {
@@ -211,8 +211,8 @@ __device__ Blended<float> blend_leaving(const LeavingSplat<F>& splat, const RayE
 /// splat): what entries carry. leave(entries), called by whole warps: composites them in order, and returns whether the
 /// lane has an open sample.
 template <class F, class Params, class PayloadOf, class Leave>
-__device__ void walk_rays(const Params& params, const TileList& list, RayStage<F>& stage, float* memory,
-                          Vec2<float> p, bool open, PayloadOf&& payload_of, Leave&& leave) {
+__device__ void walk_rays(const Params& params, const TileList& list, RayStage<F>& stage, float* memory, Vec2<float> p,
+                          bool open, PayloadOf&& payload_of, Leave&& leave) {
   RayWindow<F> window(memory, params.order.window);
   const auto take = [&](int left, int most) {
     while (__any_sync(kAllLanes, window.beyond(left) > most)) {

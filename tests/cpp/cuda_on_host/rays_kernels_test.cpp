@@ -56,9 +56,7 @@ template <class F> struct Scene {
     }
     counts.pairs = int64_t(pairs.size()), counts.splats = count;
   }
-  const float* row(int splat) const {
-    return channels == 3 ? &splats[splat].color.x : rows.data() + splat * channels;
-  }
+  const float* row(int splat) const { return channels == 3 ? &splats[splat].color.x : rows.data() + splat * channels; }
 };
 
 /// Sums are those of splats: over their pairs.
@@ -247,12 +245,13 @@ template <class F> Results reference(const Scene<F>& scene, int window) {
           contribution += grad.contribution;
         }
       }
-      const Vec2<float> mean = mean_sums_of(
-          MeanSums::kAbsolute, Vec2<float>{kWidth, kHeight},
-          transform_transposed(F::mean_map(scene.splats[event.splat].shape), shape.offset));
+      const Vec2<float> mean =
+          mean_sums_of(MeanSums::kAbsolute, Vec2<float>{kWidth, kHeight},
+                       transform_transposed(F::mean_map(scene.splats[event.splat].shape), shape.offset));
       const float numbers[kPairGradWidth] = {
-          shape.offset.x,      shape.offset.y,      shape.shape.xx,      shape.shape.xy, shape.shape.yy, weighted,
-          contribution * g[0], contribution * g[1], contribution * g[2], mean.x,         mean.y,         contribution * g[3]};
+          shape.offset.x, shape.offset.y,      shape.shape.xx,      shape.shape.xy,      shape.shape.yy,
+          weighted,       contribution * g[0], contribution * g[1], contribution * g[2], mean.x,
+          mean.y,         contribution * g[3]};
       for (int k = 0; k < kPairGradWidth; ++k) out.sums[event.splat][k] += numbers[k];
     }
   }
@@ -282,8 +281,8 @@ void expect_equal(const Results& a, const Results& b) {
 }
 
 template <class F> class RaysKernels : public testing::Test {};
-using AlongRays = testing::Types<GaussianPixels<1>, GaussianPixels<4>, Analytic<FrameGradient::kFrozen>, Moment<1>,
-                                 Moment<4>>;
+using AlongRays =
+    testing::Types<GaussianPixels<1>, GaussianPixels<4>, Analytic<FrameGradient::kFrozen>, Moment<1>, Moment<4>>;
 TYPED_TEST_SUITE(RaysKernels, AlongRays);
 
 TYPED_TEST(RaysKernels, AreWindowsOfPixels) {
