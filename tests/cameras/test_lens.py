@@ -98,9 +98,10 @@ def test_where_the_map_folds_back_nothing_is_drawn():
 
 
 def loss_of(inputs, settings, g):
-    """A weighted sum of the picture and its depth."""
+    """A weighted sum of the picture, its depth, and its inverse depth if that is asked for."""
     color, _, outputs = ar.GaussianRasterizer(settings)(**{"means2D": None} | inputs)
-    return (color * g[:3]).sum() + 0.1 * (outputs.depth * g[3]).sum()
+    loss = (color * g[:3]).sum() + 0.1 * (outputs.depth * g[3]).sum()
+    return loss if outputs.inverse_depth is None else loss + (outputs.inverse_depth * g[3]).sum()
 
 
 @each_lens
@@ -112,7 +113,7 @@ def test_devices_and_precisions_agree(device, lens):
         leaves = scenes.leaves(scenes.cast(scene, dtype, where))
         k = torch.tensor(lens.coefficients, dtype=torch.float64).requires_grad_()
         bent = lens if lens == SPHERE else ar.Lens(lens.model, k)
-        settings = settings_of(bent, dtype, where, camera_gradients=True, depth=True)
+        settings = settings_of(bent, dtype, where, camera_gradients=True, depth=True, inverse_depth=True)
         loss_of(leaves, settings, g.to(where, dtype)).backward()
         grads = {name: leaf.grad for name, leaf in leaves.items() if name != "means2D"}
         grads |= {} if lens == SPHERE else {"coefficients": k.grad}

@@ -130,7 +130,7 @@ struct FromPairs {
   __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, const SplatSums& sums,
                         Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
-    const float depth = apply_row(camera.view_z, g.means[i]);
+    const float depth = depth_of(camera, g.means[i]);
     if (params.dL_dchannels.data) {
       add_channels_vjp(params.dL_dchannels, i, depth, shown);
     } else {
