@@ -22,6 +22,7 @@ from test_render_reference import (
     MARGIN,
     exact_settings,
     probe,
+    rasterize_op,
     relative_error,
 )
 
@@ -180,17 +181,20 @@ def test_nothing_is_lost(device, best, variant, with_window):
     assert max((alpha - center)[..., clear].abs().max() for alpha in made) < most
 
 
-@each_along_rays
-@each_place
-def test_splats_apart_have_one_order(variant, device, dtype):
-    """Thin splats, one behind the other and all facing the camera: the order of centres is that along every ray."""
-    camera = SMALL.facing_z()
-    g = torch.Generator().manual_seed(2)
-    count = 40
+def layers(count=40):
+    """A camera and thin splats, one behind the other and all facing it: every order is that of their centres."""
+    camera, g = SMALL.facing_z(), torch.Generator().manual_seed(2)
     spots = scenes.rand(g, count, 2) * torch.tensor([camera.image_width, camera.image_height])
     cov2d = torch.tensor([9.0, 2.0, 4.0]) * (0.2 + scenes.rand(g, count, 1))
     depths = 1 + 0.05 * torch.randperm(count, generator=g)
-    scene = scenes.splat_scene(camera, spots, cov2d, [0.4] * count, depths, scenes.rand(g, count, 3))
+    return camera, scenes.splat_scene(camera, spots, cov2d, [0.4] * count, depths, scenes.rand(g, count, 3))
+
+
+@each_along_rays
+@each_place
+def test_splats_apart_have_one_order(variant, device, dtype):
+    """The order of centres is that along every ray."""
+    camera, scene = layers()
     settings = exact_settings(camera, torch.float64, variant)
     margin = reference.render(settings, **scene, footprint=variant[0], **variant[1]).pixel_margin
     scene = scenes.cast(scene, dtype, device)
@@ -200,6 +204,59 @@ def test_splats_apart_have_one_order(variant, device, dtype):
         assert (rays - center).abs().max() < 30 * torch.finfo(dtype).eps  # sums in another order
     else:  # tiles of another size
         assert (rays - center)[:, margin > MARGIN[dtype]].abs().max() < IMAGE_TOLERANCE[dtype]
+
+
+@each_along_rays
+@pytest.mark.parametrize("columns, means2d_z", [(4, "zero"), (3, "sum_abs"), (3, "sum_norm")])
+def test_sums_over_pixels_beside_gradients_of_means2d(variant, columns, means2d_z):
+    """Where both orders are the same, so are these."""
+    camera, scene = layers()
+    scene["means2D"] = torch.zeros(len(scene["means3D"]), columns).double()
+    made = []
+    for order in (RAY, CENTER):
+        leaves = scenes.leaves(scene)
+        settings = camera.settings(variant=variant, effects=ar.Effects(order=order))
+        color = rasterize_op(settings, leaves, means2d_z=means2d_z)[0]
+        (color * probe(camera)).sum().backward()
+        made.append(leaves["means2D"].grad)
+    assert (made[1][:, 2:] > 0).any()
+    assert relative_error(*made) < 1e-10
+
+
+@each_along_rays
+def test_covariances_of_the_caller(variant):
+    """cov3D_precomp in place of scales and rotations: the same slopes, picture and gradients."""
+    scene = tilted_scene(21)
+    covariance = reference.covariance_3d(scene["scales"], scene["rotations"], 1.0)
+    own = scenes.without(scene, "scales", "rotations")
+    own["cov3D_precomp"] = covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    settings, made = SMALL.settings(variant=variant, effects=RAYS), []
+    for given in (scene, own):
+        leaves = scenes.leaves(given)
+        color = ar.GaussianRasterizer(settings)(**leaves)[0]
+        (color * probe(SMALL)).sum().backward()
+        slopes = ar.project(settings, **scenes.without(given, "means2D")).slopes
+        made.append((slopes, color.detach(), leaves["opacities"].grad, leaves["means3D"].grad))
+    assert made[0][0].abs().max() > 1e-3
+    assert max(relative_error(*pair) for pair in zip(*made)) < 1e-8
+
+
+@each_along_rays
+def test_four_channels(variant):
+    """As two pictures of two channels each, whose gradients add up."""
+    scene = scenes.without(tilted_scene(23), "shs")
+    channels, made = scenes.rand(torch.Generator().manual_seed(1), 60, 4), []
+    for parts in ([channels], channels.split(2, 1)):
+        images, by_channels, by_opacities = [], [], 0
+        for part in parts:
+            leaves = scenes.leaves(scene | {"colors_precomp": part})
+            settings = SMALL.settings(variant=variant, effects=RAYS)._replace(bg=part.new_zeros(part.shape[1]))
+            images.append(ar.GaussianRasterizer(settings)(**leaves)[0])
+            images[-1].square().sum().backward()
+            by_channels.append(leaves["colors_precomp"].grad)
+            by_opacities = by_opacities + leaves["opacities"].grad
+        made.append((torch.cat(images).detach(), torch.cat(by_channels, 1), by_opacities))
+    assert max(relative_error(*pair) for pair in zip(*made)) < 1e-10
 
 
 def test_equal_depths_by_index(device, best):

@@ -1,13 +1,15 @@
 // A scene file that is dropped on the page is given to the command that serves it, which then serves this scene.
 
 import { READING_TIME, announce, hideProgress, showProgress } from './interface.js';
-import { get, isExported } from './load.js';
+import { isExported } from './load.js';
 
 async function openFile(file) {
   if (isExported()) throw new Error('This page holds one scene. python -m analytic_rasterizer view FILE opens another.');
   showProgress(`Opening ${file.name}`);
-  const request = { method: 'POST', body: file };
-  await get(`open?name=${encodeURIComponent(file.name)}`, `${file.name} cannot be opened.`, request);
+  const response = await fetch(`open?name=${encodeURIComponent(file.name)}`, { method: 'POST', body: file })
+    .catch(() => null);
+  if (!response) throw new Error(`${file.name} cannot be opened. Is the command that serves this page still running?`);
+  if (!response.ok) throw new Error(await response.text());
   history.replaceState(null, '', location.pathname + location.search);  // what it says is of the scene before
   location.reload();
 }

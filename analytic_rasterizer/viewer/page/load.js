@@ -49,8 +49,8 @@ export function startSorter() {
 }
 
 /// What the server answers. Throws an Error with `sentence`, and what the server says.
-export async function get(name, sentence = 'The scene cannot be loaded.', request = {}) {
-  const response = await fetch(name, request).catch(() => null);
+export async function get(name, sentence = 'The scene cannot be loaded.') {
+  const response = await fetch(name).catch(() => null);
   if (!response) throw new Error(`${sentence} Is the command that serves it still running?`);
   if (!response.ok) throw new Error(`${sentence} ${await response.text()}`);
   return response;
