@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.distributed.ranks import ALONE
 from analytic_rasterizer.training import CaptureSource, Pictures, load_pictures
@@ -29,6 +30,7 @@ IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images" / "gallery"
 SCALES = (1, 4, 8)
 QUALITY = 86  # of WebP at the full size; enlarged pixels are lossless
 WHITE = 1.0
+STATISTICS = ar.Effects(gaussian_stats=True)
 COUNTED = 0.9  # share of the photographs that show a Gaussian and count it, at least
 
 
@@ -80,6 +82,19 @@ def counted(items: list[Photograph], points: Tensor) -> Tensor:
     return (shown > 0) & (kept >= COUNTED * shown)
 
 
+@torch.no_grad()
+def most_shown(scene, views: list[io.View], footprint: str, most: int) -> Tensor:
+    """(N,) bool: the `most` Gaussians that add the most to the pictures of the views, in sums of their weights."""
+    shown = torch.zeros(scene.count)
+    for view in views:
+        settings = view.settings(1, sh_degree=scene.sh_degree, footprint=footprint, effects=STATISTICS)
+        outputs = ar.GaussianRasterizer(settings)(**scene.arguments(), means2D=None)[2]
+        shown += outputs.gaussian_stats.sum_weight
+    chosen = torch.zeros(scene.count, dtype=torch.bool)
+    chosen[shown.topk(min(most, scene.count)).indices] = True
+    return chosen & (shown > 0)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -90,17 +105,21 @@ def main() -> None:
     add("--scales", nargs="+", type=int, default=SCALES, metavar="N")
     add("--footprint", metavar="NAME[:k=v]", help="(default: that of the training)")
     add("--cut", type=Path, metavar="FILE", help="write the scene without what masks leave out")
+    add("--most", type=int, metavar="N", help="of --cut: Gaussians to keep, those that views show the most of")
     add("--out", type=Path, default=IMAGES, metavar="DIR")
     args = parser.parse_args()
     found = io.find_scene(args.training)
     capture, scene = capture_of(args.training, args.data), io.load_scene(found.path)
+    footprint = str(found.choose_footprint(args.footprint).footprint)
     if args.cut is not None:
         scene = scene.rows(counted([*capture.train, *capture.test], scene.means))
+        if args.most is not None:
+            scene = scene.rows(most_shown(scene, [item.view for item in capture.train], footprint, args.most))
         io.save_scene(args.cut, scene, found.metadata)
+        print(f"{args.cut}: {scene.count} Gaussians")
     chosen = [item for item in capture.test if not args.views or Path(item.view.name).stem in args.views]
     args.out.mkdir(parents=True, exist_ok=True)
     pictures = load_pictures(chosen, tuple(args.scales), (WHITE,) * 3, "cpu")
-    footprint = str(found.choose_footprint(args.footprint).footprint)
     for stem, scale, value in draw(scene, pictures, footprint, args.out, args.name):
         print(f"{stem} 1/{scale}: {value:.2f} dB")
 
