@@ -73,6 +73,7 @@ def counted(items: list[Photograph], points: Tensor) -> Tensor:
     shown, kept = points.new_zeros(len(points)), points.new_zeros(len(points))
     for item in items:
         mask, view = counted_pixels(item.files[1], item.mask), item.view
+        mask = torch.ones(view.height, view.width, dtype=torch.bool) if mask is None else mask
         w2c = view.w2c.double()
         inside = view.pixels_of(points.double() @ w2c[:3, :3].T + w2c[:3, 3])
         column, row = (inside * inside.new_tensor([mask.shape[1] / view.width, mask.shape[0] / view.height])).unbind(1)

@@ -4,7 +4,8 @@
     python benchmarks/llff.py maryRose maryrose --reduce 4
 
 SOURCE has `images`, `poses_bounds.npy` with a camera for each in the order of their names, and if there are masks
-`masks/NAME_mask.*`, white where a photograph counts. Pictures are averaged over squares of `--reduce` pixels.
+`masks/NAME_mask.*`, white where a photograph counts. Pictures are averaged over squares of `--reduce` pixels. With
+`--alpha` masks become the alpha of the pictures: what they leave out is empty, where otherwise nothing is said of it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
 
 
-def convert(source: Path, out: Path, reduce: int) -> int:
+def convert(source: Path, out: Path, reduce: int, alpha: bool = False) -> int:
     """Writes the capture; returns the number of its photographs."""
     Image = optional_import("PIL.Image")
     names, masks = pictures_in(source / "images"), pictures_in(source / "masks")
@@ -45,19 +46,23 @@ def convert(source: Path, out: Path, reduce: int) -> int:
     matrices, sizes = cameras(source / "poses_bounds.npy")
     if len(names) != len(matrices):
         raise SystemExit(f"{source}: {len(matrices)} cameras for {len(names)} pictures in images")
-    for folder in ("images", "masks")[: 1 + bool(masks)]:
+    for folder in ("images",) if alpha or not masks else ("images", "masks"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     frames = []
     for path, matrix, (_, before, focal) in zip(names, matrices, sizes):
         picture = Image.open(path).convert("RGB").reduce(reduce)
-        picture.save(out / "images" / f"{path.stem}.png")
         focal *= picture.width / before
         width, height = picture.size
         camera = {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
         frames.append({"file_path": f"images/{path.stem}.png", "transform_matrix": matrix.tolist(), **camera})
         if path.stem in of_name:
-            frames[-1]["mask_path"] = f"masks/{path.stem}.png"
-            Image.open(of_name[path.stem]).convert("L").reduce(reduce).save(out / frames[-1]["mask_path"])
+            mask = Image.open(of_name[path.stem]).convert("L").reduce(reduce)
+            if alpha:
+                picture.putalpha(mask)
+            else:
+                frames[-1]["mask_path"] = f"masks/{path.stem}.png"
+                mask.save(out / frames[-1]["mask_path"])
+        picture.save(out / "images" / f"{path.stem}.png")
     text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1)
     (out / "transforms.json").write_text(text)
     return len(frames)
@@ -69,8 +74,9 @@ def main() -> None:
     add("source", type=Path, help="folder with images, masks and poses_bounds.npy")
     add("out", type=Path, help="folder to write")
     add("--reduce", type=int, default=1, metavar="N", help="side of the squares of pixels (default: 1)")
+    add("--alpha", action="store_true", help="masks become the alpha of the pictures")
     args = parser.parse_args()
-    print(f"{args.out}: {convert(args.source, args.out, args.reduce)} photographs")
+    print(f"{args.out}: {convert(args.source, args.out, args.reduce, args.alpha)} photographs")
 
 
 if __name__ == "__main__":

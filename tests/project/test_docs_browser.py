@@ -23,6 +23,7 @@ PAGES = (
     "beside",
     "conventions",
     "troubleshooting",
+    "gallery",
 )
 LEGIBLE = 550  # px, of a figure whose labels are made for a page of 700
 SMALL = 340  # px, of one whose labels are made for a phone
@@ -89,6 +90,21 @@ def test_plots_are_dark_on_a_dark_page(site, browser):
     with open_page(browser, (site / "performance.html").as_uri(), size=(800, 800), color_scheme="dark") as page:
         filters = page.evaluate("() => [...document.querySelectorAll('img.plot')].map(i => getComputedStyle(i).filter)")
     assert filters and all("invert" in each for each in filters)
+
+
+@pytest.mark.gate
+def test_a_divider_follows_the_mouse_and_the_keys(site, browser):
+    """What is left of it is the photograph."""
+    shown = "() => getComputedStyle(document.querySelector('.divided img + img')).clipPath"
+    with open_page(browser, (site / "gallery.html").as_uri(), size=(800, 900)) as page:
+        box = page.locator(".divided").first
+        assert page.evaluate(shown).endswith("50%)")
+        area = box.bounding_box()
+        box.click(position={"x": 0.25 * area["width"], "y": 0.5 * area["height"]})
+        left = float(page.evaluate(shown).split()[-1].rstrip("%)"))
+        assert 20 < left < 30
+        page.keyboard.press("ArrowRight")
+        assert float(page.evaluate(shown).split()[-1].rstrip("%)")) == left + 1
 
 
 def test_every_name_of_the_api_is_a_link(site):

@@ -57,6 +57,10 @@ def test_gallery(tmp_path, monkeypatch, capsys, programs):
         item = read[view.name]
         assert (item.view.width, item.view.fx) == (16, 18.0)
         torch.testing.assert_close(item.view.w2c, view.w2c, rtol=0, atol=1e-12)
+    assert "9 photographs" in run(llff, tmp_path / "llff", tmp_path / "cut out", "--alpha")
+    assert not (tmp_path / "cut out" / "masks").exists()
+    with Image.open(tmp_path / "cut out" / "images" / "r_3.png") as picture:
+        assert picture.mode == "RGBA" and np.asarray(picture)[:, :, 3].mean() == pytest.approx(255 / 4)
     training = ["--iterations", "2", "--random-points", "300", "--device", "cpu", "--no-evaluate", "--threads", "1"]
     cli.main(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "out"), *training])
     capsys.readouterr()
