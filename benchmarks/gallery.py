@@ -3,9 +3,9 @@
     python benchmarks/gallery.py TRAINING --name maryrose --views IMG_9693 IMG_9725
 
 TRAINING is the folder that `train` wrote. Each photograph and each rendering is a file, at each of `--scales`; coarse
-ones have their pixels enlarged, so that all have one size. What masks leave out is white in both. `--cut FILE` writes
-the scene without Gaussians that masks leave out, for the page that `view --export` makes. It prints the PSNR of each
-pair, dB, over what counts.
+ones have their pixels enlarged, so that all have one size. What masks leave out is white in both, and what is
+transparent too. `--cut FILE` writes the scene without Gaussians that masks leave out, to go on from. It prints the PSNR
+of each pair, dB, over what counts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.distributed.ranks import ALONE
 from analytic_rasterizer.training import CaptureSource, Pictures, load_pictures
@@ -30,7 +29,7 @@ IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images" / "gallery"
 SCALES = (1, 4, 8)
 QUALITY = 86  # of WebP at the full size; enlarged pixels are lossless
 WHITE = 1.0
-STATISTICS = ar.Effects(gaussian_stats=True)
+SHOWN = 0.5  # share of the photographs that show a point of an object
 COUNTED = 0.9  # share of the photographs that show a Gaussian and count it, at least
 
 
@@ -69,7 +68,7 @@ def draw(scene, pictures: Pictures, footprint: str, out: Path, name: str) -> lis
 
 
 def counted(items: list[Photograph], points: Tensor) -> Tensor:
-    """(P,) bool: points (P, 3) that nearly all photographs count which show them, and one at least."""
+    """(P,) bool: points (P, 3) that SHOWN of the photographs show, at least, and nearly all of these count."""
     shown, kept = points.new_zeros(len(points)), points.new_zeros(len(points))
     for item in items:
         mask, view = counted_pixels(item.files[1], item.mask), item.view
@@ -80,20 +79,7 @@ def counted(items: list[Photograph], points: Tensor) -> Tensor:
         seen = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
         shown += seen
         kept[seen] += mask[row[seen].long(), column[seen].long()].to(kept.dtype)
-    return (shown > 0) & (kept >= COUNTED * shown)
-
-
-@torch.no_grad()
-def most_shown(scene, views: list[io.View], footprint: str, most: int) -> Tensor:
-    """(N,) bool: the `most` Gaussians that add the most to the pictures of the views, in sums of their weights."""
-    shown = torch.zeros(scene.count)
-    for view in views:
-        settings = view.settings(1, sh_degree=scene.sh_degree, footprint=footprint, effects=STATISTICS)
-        outputs = ar.GaussianRasterizer(settings)(**scene.arguments(), means2D=None)[2]
-        shown += outputs.gaussian_stats.sum_weight
-    chosen = torch.zeros(scene.count, dtype=torch.bool)
-    chosen[shown.topk(min(most, scene.count)).indices] = True
-    return chosen & (shown > 0)
+    return (shown >= SHOWN * len(items)) & (kept >= COUNTED * shown)
 
 
 def main() -> None:
@@ -106,7 +92,6 @@ def main() -> None:
     add("--scales", nargs="+", type=int, default=SCALES, metavar="N")
     add("--footprint", metavar="NAME[:k=v]", help="(default: that of the training)")
     add("--cut", type=Path, metavar="FILE", help="write the scene without what masks leave out")
-    add("--most", type=int, metavar="N", help="of --cut: Gaussians to keep, those that views show the most of")
     add("--out", type=Path, default=IMAGES, metavar="DIR")
     args = parser.parse_args()
     found = io.find_scene(args.training)
@@ -114,8 +99,6 @@ def main() -> None:
     footprint = str(found.choose_footprint(args.footprint).footprint)
     if args.cut is not None:
         scene = scene.rows(counted([*capture.train, *capture.test], scene.means))
-        if args.most is not None:
-            scene = scene.rows(most_shown(scene, [item.view for item in capture.train], footprint, args.most))
         io.save_scene(args.cut, scene, found.metadata)
         print(f"{args.cut}: {scene.count} Gaussians")
     chosen = [item for item in capture.test if not args.views or Path(item.view.name).stem in args.views]
