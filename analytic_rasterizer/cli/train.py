@@ -213,6 +213,9 @@ def finish(training: Run, complete: bool, args) -> None:
     say(f"{Path(args.out) / SCENE}: {training.count()} Gaussians")
     if training.trainer.dropped:
         say(f"{training.trainer.dropped:,} Gaussians were taken away because their numbers had left float32")
+    counting = training.trainer.counting
+    if counting is not None and counting.pruned:
+        say(f"{counting.pruned:,} Gaussians were taken away because masks leave out all that they show")
     if args.export:
         say(f"{training.export_mip()}: for viewers that do not integrate over pixels")
     if not args.no_evaluate:

@@ -24,6 +24,7 @@ from ..distributed.cameras import agreed_step
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..optim import MOMENTS
+from .counting import COUNTED
 from .extent import extent_of
 from .rendering import enlarged
 from .trainer import Trainer
@@ -216,6 +217,7 @@ class ShardedTrainer(Trainer):
             optimizer.state[of_new] = state | {moment: moved(state[moment]) for moment in MOMENTS}
             group["params"] = [of_new]
         self.density.gaussians = new
+        self.density.extra = {name: moved(tensor) for name, tensor in self.density.extra.items()}
         self.density.forget()
 
     @torch.no_grad()
@@ -248,6 +250,8 @@ class ShardedTrainer(Trainer):
         state["density"] |= {name: whole(state["density"][name]) for name in self.density.row_state}
         if self.filter_3d is not None:
             state["filter_3d"] = whole(self.filter_3d)
+        if self.counting is not None:
+            state["counting"][COUNTED] = whole(state["counting"][COUNTED])
         return state | {"shards": self.ranks.exchange(len(self.gaussians.means))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -273,6 +277,8 @@ class ShardedTrainer(Trainer):
             "density": density | {name: part(density[name]) for name in self.density.row_state},
             "filter_3d": None if state["filter_3d"] is None else part(state["filter_3d"]),
         }
+        if state.get("counting") is not None:
+            own["counting"] = state["counting"] | {COUNTED: part(state["counting"][COUNTED])}
         super().load_state_dict(state | own)
 
 

@@ -21,6 +21,7 @@ from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .corrections import Corrections
+from .counting import Counting, no_rows
 from .depth_targets import Targets
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
@@ -120,10 +121,12 @@ class Trainer:
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = TrainingAdam(groups, eps=ADAM_EPS)
-        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
+        self.order = PictureOrder(len(pictures.views), options)
+        self.counting = Counting(len(self.order.pairs)) if Counting.called_for(options, pictures) else None
+        extra = None if self.counting is None else no_rows(gaussians)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks, extra)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
-        self.order = PictureOrder(len(pictures.views), options)
         self.corrections = Corrections(options, pictures.views, self.device)
         self.filter_3d: Tensor | None = None
         share = 1 / options.pictures_per_step  # of a picture's loss in that of the step
@@ -168,6 +171,8 @@ class Trainer:
         self._set_rates()
         loss, rows = self._differentiate()
         self.losses.append(loss)
+        if self.counting is not None:
+            self.counting.observe(self)
         optimizer.update(rows)
         optimizer.zero_grad(set_to_none=True)
         progress.advance(stride)
@@ -175,6 +180,8 @@ class Trainer:
             self.check()
         elif self._may_change():
             drop_broken(self)  # before they multiply
+        if self.counting is not None and self._may_change():
+            self.counting.drop(self)
         before = self.count
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
@@ -396,6 +403,7 @@ class Trainer:
             "progress": self.progress.state_dict(),
             "generator": self.generator.get_state(),
             "filter_3d": self.filter_3d,
+            "counting": None if self.counting is None else self.counting.state_dict(self.density),
             "extent": self.extent,
             "dropped": self.dropped,
         } | self.corrections.state_dict()
@@ -413,6 +421,8 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
         self.corrections.load_state_dict(state)
+        if self.counting is not None and state.get("counting") is not None:  # earlier versions did not count
+            self.counting.load_state_dict(self.density, state["counting"])
         self.losses, self._last = [], None
         # Checkpoints of earlier versions have neither.
         self.extent = self.density.extent = state.get("extent", self.extent)
@@ -426,9 +436,10 @@ def make_density(
     extent: float,
     white_background: bool = False,
     ranks: Ranks = ALONE,
+    extra: dict[str, Tensor] | None = None,
 ) -> FixedDensity:
     """The density control that `options.density` names, with what the options say about it."""
-    told, common = options.control, {"seed": options.seed, "ranks": ranks}
+    told, common = options.control, {"seed": options.seed, "ranks": ranks, "extra": extra}
     if told is None:
         return FixedDensity(gaussians, optimizer, **common)
     if isinstance(told, MonteCarloOptions):

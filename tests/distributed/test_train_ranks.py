@@ -40,6 +40,7 @@ LARGER_STEPS = {"pictures_per_step": 2, "supersampling": 2}
 VARIANTS = {
     "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
     "sparse": {"sparse_adam": True},
+    "masked": {"alpha": "mask"},
     "mcmc": {"density": "mcmc", "max_gaussians": 150, "background": "random", **LARGER_STEPS},
 }
 CAMERAS = 2  # of the step whose gradients are compared
@@ -100,7 +101,7 @@ def work(rank, world, folder):
 def repeat(scene, out, ranks, more):
     """A training to its end, and once more with a break after about half of it, and pictures in their files."""
     whole, part = (make_run(scene, out / name, ranks, **more) for name in ("whole", "part"))
-    if whole.options.sparse_adam:
+    if whole.options.sparse_adam or "alpha" in more:
         for run in (whole, part):
             scatter(run.trainer.gaussians)
     whole.train()
@@ -258,6 +259,17 @@ def test_gaussians_are_spread_evenly_and_stay_within_the_limit(made, name):
     total = len(state["gaussians"]["means"])
     assert sum(state["shards"]) == total and max(state["shards"]) * len(state["shards"]) <= UNEVEN * total
     assert total <= (COMMON | VARIANTS[name])["max_gaussians"]
+
+
+def test_what_no_picture_of_any_rank_counts_is_pruned(made):
+    """A third, which `scatter` has moved to where no picture shows it, and all that masks leave out."""
+    for name in VARIANTS:
+        counting = checkpoint_in(made / name / "whole")["counting"]
+        assert (counting is not None) == (name == "masked")
+    state = checkpoint_in(made / "masked" / "whole")
+    assert state["counting"]["pruned"] >= COMMON["random_points"] / 3
+    assert len(state["counting"]["counted"]) == len(state["gaussians"]["means"])
+    assert state["gaussians"]["means"][:, 1].max() < 40
 
 
 def test_two_ranks_then_one_then_three(made):
