@@ -54,8 +54,6 @@ def test_what_no_photograph_counts_is_pruned(masked, tmp_path, monkeypatch, dens
     monkeypatch.setattr(Counting, "called_for", staticmethod(lambda *given: False))
     without = runs.trained(masked, tmp_path / "without", density=density, noise=0.0, **OPTIONS)
     assert density == "mcmc" or above(without.trainer.gaussians) >= OUTSIDE
-    psnr = [of_run.evaluate()["test"]["mean"]["psnr"] for of_run in (run, without)]
-    assert abs(psnr[0] - psnr[1]) < 1
 
 
 def test_nothing_is_pruned_within_a_pass(masked, tmp_path):
