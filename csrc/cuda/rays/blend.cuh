@@ -1,4 +1,5 @@
-// Kernel blend_rays: the forward pass in the order along rays, for up to four channels. A block per tile.
+// Kernel blend_rays: the forward pass in the order along rays, for up to four channels. A warp, its own block,
+// for each half of a tile.
 #pragma once
 
 #include "cuda/rays/walk.cuh"
@@ -8,20 +9,20 @@ namespace ar::cuda {
 
 /// C: 3 channels in the splats, or up to 4 in rows. With a backward pass `last` gets numbers of composited splats.
 template <class F, int C>
-__global__ void __launch_bounds__(kRayThreads, blocks_per_sm(RayPolicy::kBlocks<F>, kRayThreads))
-    blend_rays_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kAtOnce = RayPolicy::kAtOnce<F>;
   auto& stage = *reinterpret_cast<RayStage<F>*>(dynamic_shared());
-  auto* const memory = reinterpret_cast<float*>(&stage + 1);
-  const TileList list = list_of(params.lists, params.grid, params.plan.tile_order[blockIdx.x]);
-  const Vec2<float> p = RayBoxes::pixel();
+  const TileList list = list_of(params.lists, params.grid, params.plan.tile_order[blockIdx.x / kRayHalves]);
+  const int half = blockIdx.x % kRayHalves;
+  const Vec2<float> p = ray_pixel(half);
   const Pixel pixel(list, params.grid, p);
   RaySamples<F> samples(pixel.inside);
   Values<C> sums = {};
   int last[S] = {};
   walk_rays<F>(
-      params, list, stage, memory, p, pixel.inside, [](int, int32_t id) { return id; },
+      params, list, stage, reinterpret_cast<RayEntry*>(&stage + 1), half, pixel.inside,
+      [](int, int32_t id) { return id; },
       [&](const RayEntry(&entries)[kAtOnce]) {
         Values<C> channels[kAtOnce];
         LeavingSplat<F> leaving[kAtOnce] = {};
@@ -33,7 +34,8 @@ __global__ void __launch_bounds__(kRayThreads, blocks_per_sm(RayPolicy::kBlocks<
         }
         AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
           add_samples<S>(sums, channels[i], [&](int s) {
-            const Blended<float> b = blend_leaving(leaving[i], entries[i], p, s, samples);
+            float raw;
+            const Blended<float> b = blend_leaving(leaving[i], entries[i], p, s, samples, raw);
             last[s] += b.mask;
             return b;
           });

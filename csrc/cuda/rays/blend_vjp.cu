@@ -6,6 +6,8 @@
 
 namespace ar::cuda {
 
+using namespace by_blocks;
+
 RayLog ray_log(int footprint, TileGrid grid, int64_t& words) {
   RayLog log = {};
   words = 0;

@@ -6,14 +6,15 @@
 namespace ar::cuda {
 
 struct RayPolicy {
-  /// Entries that may have left the window of a pixel before a warp composites them: lanes composite together, against
-  /// shared memory.
+  /// Entries of a lane between two times that its window is sorted: lanes do so together, against shared memory.
   static constexpr int kPending = 8;
+  /// Slots of a window that are read together: waiting, against reads in vain.
+  static constexpr int kTogether = 4;
   /// Entries of a lane whose splats are loaded together: waiting, against registers.
-  template <class F> static constexpr int kAtOnce = F::kSamples > 1 ? 1 : 4;
+  template <class F> static constexpr int kAtOnce = F::kSamples > 1 ? 1 : 2;
 
-  /// Blocks on a multiprocessor, against registers.
-  template <class F> static constexpr int kBlocks = F::kExpensive || F::kSamples > 1 ? 8 : 12;
+  /// Blocks, of a warp, on a multiprocessor, against registers. Some devices hold no more.
+  static constexpr int kBlocks = 16;
   template <class F> static constexpr int kVjpBlocks = F::kExpensive || F::kSamples > 1 ? 6 : 10;
 
   /// Most bytes of a RayLog, and most rows of a warp: lists in which more is composited are walked again.

@@ -7,9 +7,9 @@
 // The log keeps the last rows. If there were more, the block composites the tile again up to the first row kept.
 #pragma once
 
-#include "cuda/rays/walk.cuh"
+#include "cuda/rays/vjp_walk.cuh"
 
-namespace ar::cuda {
+namespace ar::cuda::by_blocks {
 
 /// In a row of the log a lane has its place in the list (-1: nothing was composited), and where its samples were, or
 /// the opacity * weight of its one sample.
@@ -284,4 +284,4 @@ __global__ void __launch_bounds__(kRayThreads, blocks_per_sm(RayPolicy::kVjpBloc
   }
 }
 
-}  // namespace ar::cuda
+}  // namespace ar::cuda::by_blocks

@@ -67,7 +67,7 @@ struct Results {
 
 struct Way {
   int window = 24;
-  int log_rows = 1000;
+  int log_rows = 1024;
   bool overflow = false;  ///< there is no room for a list of each tile
 };
 
@@ -102,8 +102,8 @@ template <class F, int C> Results run(const Scene<F>& scene, Way way) {
   blend.lists = lists_of(pairs, offsets, counts);
   blend.plan.tile_order = order.data();
   blend.order = {scene.depths.data(), way.window};
-  EXPECT_LE(int64_t(sizeof(RayVjpShared<F, C>)) + RayWindow<F>::bytes(way.window), int64_t(sizeof dynamic_memory));
-  cuda_on_host::launch(tiles, kRayThreads, [&] { blend_rays_kernel<F, C>(blend); });
+  EXPECT_LE(int64_t(sizeof(RayStage<F>)) + RayWindow::bytes(way.window), int64_t(sizeof dynamic_memory));
+  cuda_on_host::launch(tiles * kRayHalves, 32, [&] { blend_rays_kernel<F, C>(blend); });
 
   BlendVjpParams vjp = {};
   vjp.grid = kGrid;
@@ -119,12 +119,15 @@ template <class F, int C> Results run(const Scene<F>& scene, Way way) {
   vjp.chunks_taken = &chunks_taken;
   vjp.mean_sums = MeanSums::kAbsolute;
   vjp.order = blend.order;
-  std::vector<uint32_t> words(size_t(kBlocks * kRayWarps * way.log_rows * 32 * kLogWords<F>), 0x7fc00000);
+  std::vector<uint32_t> words(size_t(kBlocks * by_blocks::kRayWarps * way.log_rows * 32 * by_blocks::kLogWords<F>),
+                              0x7fc00000);
   vjp.ray_log = {words.data(), kBlocks, way.log_rows};
   const size_t rows = way.overflow ? count : pairs.size();
   std::vector<float> pair_grads(rows * kPairGradWidth, way.overflow ? 0 : NAN);
   vjp.pair_grads = pair_grads.data();
-  cuda_on_host::launch(kBlocks, kRayThreads, [&] { blend_rays_vjp_kernel<F, C>(vjp); });
+  EXPECT_LE(int64_t(sizeof(by_blocks::RayVjpShared<F, C>)) + by_blocks::RayWindow<F>::bytes(way.window),
+            int64_t(sizeof dynamic_memory));
+  cuda_on_host::launch(kBlocks, by_blocks::kRayThreads, [&] { by_blocks::blend_rays_vjp_kernel<F, C>(vjp); });
   out.sums.assign(count, std::vector<float>(kPairGradWidth));
   for (size_t row = 0; row < rows; ++row) {
     for (int k = 0; k < kPairGradWidth; ++k) out.sums[row % count][k] += pair_grads[row * kPairGradWidth + k];
@@ -299,20 +302,21 @@ TYPED_TEST(RaysKernels, AreWindowsOfPixels) {
 TYPED_TEST(RaysKernels, LogAnyNumberOfRowsAtOnce) {
   using F = TypeParam;
   const Scene<F> scene(150, 3, 0.3f);
-  const Results whole = run<F, 3>(scene, {24, 1000});
-  for (const int rows : {1, 7, 64}) expect_equal(run<F, 3>(scene, {24, rows}), whole);
+  const Results whole = run<F, 3>(scene, {24, 1024});
+  for (const int rows : {1, 8, 64}) expect_equal(run<F, 3>(scene, {24, rows}), whole);
 }
 
 TYPED_TEST(RaysKernels, ShareLists) {
   using F = TypeParam;
   const Scene<F> scene(70, 3, 0.5f);
-  expect_near(run<F, 3>(scene, {24, 20, true}), run<F, 3>(scene, {24}));
+  expect_near(run<F, 3>(scene, {24, 16, true}), run<F, 3>(scene, {24}));
 }
 
 /// A device of 7.5 has 64 KiB.
 TYPED_TEST(RaysKernels, FitIntoSharedMemory) {
   using F = TypeParam;
-  EXPECT_LE(int64_t(sizeof(RayVjpShared<F, 4>)) + RayWindow<F>::bytes(kMaxRayWindow), 64 * 1024);
+  EXPECT_LE(int64_t(sizeof(RayStage<F>)) + RayWindow::bytes(kMaxRayWindow), 64 * 1024);
+  EXPECT_LE(int64_t(sizeof(by_blocks::RayVjpShared<F, 4>)) + by_blocks::RayWindow<F>::bytes(kMaxRayWindow), 64 * 1024);
 }
 
 }  // namespace
