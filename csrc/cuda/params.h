@@ -155,8 +155,8 @@ struct InspectParams : ar::InspectParams<float> {
 
 /// rays/: what the lanes of a warp have composited, in rows that are logged again once there are more.
 struct RayLog {
-  uint32_t* words;  ///< [blocks, warps of a block, rows, words of a row, 32]
-  int blocks, rows;
+  uint32_t* words;   ///< [blocks, rows, words of a row, 32]
+  int blocks, rows;  ///< rows: a power of two
 };
 
 /// Without channels.data dL_dimage.first is not null.

@@ -15,9 +15,11 @@ struct RayPolicy {
 
   /// Blocks, of a warp, on a multiprocessor, against registers. Some devices hold no more.
   static constexpr int kBlocks = 16;
-  template <class F> static constexpr int kVjpBlocks = F::kExpensive || F::kSamples > 1 ? 6 : 10;
+  /// Blocks of the backward pass for each multiprocessor, which share the tiles, against memory for RayLog.
+  static constexpr int kVjpBlocks = 18;
 
-  /// Most bytes of a RayLog, and most rows of a warp: lists in which more is composited are walked again.
+  /// Most bytes of a RayLog, and most rows of a warp, a power of two: lists in which more is composited are walked
+  /// again.
   static constexpr int64_t kLogBytes = int64_t(384) << 20;
   static constexpr int kLogRows = 256;
 };

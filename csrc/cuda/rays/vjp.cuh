@@ -1,94 +1,81 @@
 // Kernel blend_rays_vjp: the backward pass in the order along rays, for up to four channels. The order is taken as
-// given. A block composites a tile again, each warp logging row by row what its lanes composited (RayLog). Then one
-// warp after the other walks back over its log. Lanes are at different splats: in every row of the log those with the
-// same splat are added up, lane after lane, and then added to the row of the pair. The tile has no other block, and
-// __syncwarp() is between rows, so that all sums have a fixed order; only tiles of a patch change it.
+// given. A warp, its own block, composites half a tile again, each lane logging what it composited (RayLog), and then
+// walks back over the log. In each step the splat of the farthest event that is next in any lane is done by all lanes
+// in which it is next: mostly by all that see it, since neighbours see it at nearly the same depth. The tile has no
+// other warp, and a value of the sum is always added by the same lane, so that all sums have a fixed order; only tiles
+// of a patch change it.
 //
-// The log keeps the last rows. If there were more, the block composites the tile again up to the first row kept.
+// The log keeps the last events of a lane. If one is lost, the warp composites the half again, each lane up to there.
 #pragma once
 
-#include "cuda/rays/vjp_walk.cuh"
+#include <limits>
 
-namespace ar::cuda::by_blocks {
+#include "cuda/rays/walk.cuh"
 
-/// In a row of the log a lane has its place in the list (-1: nothing was composited), and where its samples were, or
-/// the opacity * weight of its one sample.
-template <class F> inline constexpr int kLogWords = 1 + (F::kMoves ? 2 * F::kSamples : kKeepsRaw<F> ? 1 : 0);
+namespace ar::cuda {
+
+/// Whether the log keeps the opacity * weight of the one sample. Otherwise it is evaluated again.
+template <class F> inline constexpr bool kLogsRaw = !F::kMoves && F::kSamples == 1;
+
+/// RayEvent, and where samples were that move, or opacity * weight.
+template <class F> inline constexpr int kLogWords = 3 + (F::kMoves ? 2 * F::kSamples : kLogsRaw<F> ? 1 : 0);
 
 /// Values of PairGrad and C channels.
 template <int C> inline constexpr int kRaySums = kPairChannels + C;
 
-template <class F, int C> struct RayVjpShared {
-  RayStage<F> stage;
-  float of_lanes[32 * (kRaySums<C> | 1)];  ///< of the one warp that walks back
-  int32_t rows[kRayWarps];                 ///< of the logs
-  int chunk;
-};
+/// A splat that a lane has composited.
+struct RayEvent {
+  static constexpr int kNone = std::numeric_limits<int>::min(), kLost = std::numeric_limits<int>::max();
 
-/// Adds to rows of pair_grads what lanes have for them: value k to column(k). A lane with row -1 has nothing.
-/// `of_lanes` has room for 32 (kCount | 1) numbers.
-template <int kCount, class Column>
-__device__ void add_to_rows(float* of_lanes, const float (&values)[kCount], int32_t row, float* pair_grads,
-                            Column&& column) {
-  constexpr int kStride = kCount | 1, kAtOnce = 32 / kCount;  // rows that are added to together
-  const int lane = lane_id(), own = lane / kCount, k = lane % kCount;
-  AR_UNROLL for (int v = 0; v < kCount; ++v) of_lanes[lane * kStride + v] = values[v];
-  const uint32_t alike = __match_any_sync(kAllLanes, row);
-  uint32_t leaders = __ballot_sync(kAllLanes, row >= 0 && (alike & ((1u << lane) - 1)) == 0);
-  __syncwarp();
-  while (leaders != 0) {
-    int leader = -1;
-    AR_UNROLL for (int g = 0; g < kAtOnce; ++g) {
-      if (g == own) leader = __ffs(int(leaders)) - 1;
-      leaders &= leaders - 1;  // zero stays zero
-    }
-    uint32_t members = shuffle(alike, leader & 31);
-    const int32_t to = shuffle(row, leader & 31);
-    if (leader >= 0) {
-      float sum = 0;
-      for (; members != 0; members &= members - 1) sum += of_lanes[(__ffs(int(members)) - 1) * kStride + k];
-      atomicAdd(pair_grads + int64_t(to) * kPairGradWidth + column(k), sum);
-    }
-    __syncwarp();
+  int distance = kNone;     ///< ordered as depths; kLost: no longer in the log
+  SlotPair pair = {0, -1};  ///< slot -1: of none
+  float raw = 0;            ///< if kLogsRaw
+
+  RayEvent() = default;
+  /// The bits of positive numbers have their order. Others only come in another one.
+  __device__ RayEvent(float depth, SlotPair pair, float raw) : pair(pair), raw(raw) {
+    distance = min(max(__float_as_int(depth), kNone + 1), kLost - 1);
   }
-}
+};
 
 /// A lane's part of the log. Only the lane itself reads it.
 template <class F> class LaneLog {
  public:
-  __device__ explicit LaneLog(const RayLog& log)
-      : words_(log.words + (int64_t(blockIdx.x) * kRayWarps + threadIdx.x / 32) * log.rows * kRowWords + lane_id()),
-        rows_(log.rows) {}
+  /// Where samples that move were, before the splat.
+  struct alignas(F::kSamples > 1 ? 16 : 8) Places {
+    Vec2<float> of[F::kSamples];
+  };
+  const int rows;
 
-  __device__ void put(int row, int32_t place, const RayEntry& entry, const Vec2<float>* places) const {
+  __device__ explicit LaneLog(const RayLog& log)
+      : rows(log.rows), words_(log.words + int64_t(blockIdx.x) * log.rows * kRowWords + lane_id()) {}
+
+  __device__ void put(int row, const RayEvent& event) const {
     uint32_t* const to = row_at(row);
-    to[0] = uint32_t(place);
-    if constexpr (kKeepsRaw<F>) to[32] = __float_as_uint(entry.raw);
-    if constexpr (F::kMoves) {
-      AR_UNROLL for (int s = 0; s < F::kSamples; ++s) {
-        to[(2 * s + 1) * 32] = __float_as_uint(places[s].x);
-        to[(2 * s + 2) * 32] = __float_as_uint(places[s].y);
-      }
-    }
+    to[0] = uint32_t(event.distance);
+    to[32] = uint32_t(event.pair.splat);
+    to[64] = uint32_t(event.pair.slot);
+    if constexpr (kLogsRaw<F>) to[96] = __float_as_uint(event.raw);
   }
-  __device__ void get(int row, RayEntry& entry, Vec2<float>* places) const {
+  /// May be called for rows that were not put.
+  __device__ RayEvent event(int row) const {
     const uint32_t* const from = row_at(row);
-    entry.payload = int32_t(from[0]);
-    if constexpr (kKeepsRaw<F>) entry.raw = __int_as_float(int(from[32]));
-    if constexpr (F::kMoves) {
-      AR_UNROLL for (int s = 0; s < F::kSamples; ++s) {
-        places[s] = {__int_as_float(int(from[(2 * s + 1) * 32])), __int_as_float(int(from[(2 * s + 2) * 32]))};
-      }
-    }
+    RayEvent event;
+    event.distance = int(from[0]);
+    event.pair = {int32_t(from[32]), int32_t(from[64])};
+    if constexpr (kLogsRaw<F>) event.raw = __int_as_float(int(from[96]));
+    return event;
+  }
+  __device__ Places& places(int row) const {
+    return reinterpret_cast<Places*>(row_at(row) - lane_id() + 96)[lane_id()];
   }
 
  private:
   static constexpr int kRowWords = 32 * kLogWords<F>;
 
-  __device__ uint32_t* row_at(int row) const { return words_ + int64_t(row % rows_) * kRowWords; }
+  __device__ uint32_t* row_at(int row) const { return words_ + (row & (rows - 1)) * kRowWords; }
 
   uint32_t* const words_;
-  const int rows_;
 };
 
 /// What a lane carries back from splat to splat.
@@ -97,7 +84,7 @@ template <class F, int C> struct RayAdjoint {
   Values<C> gradient;  ///< of one sample's channels
   float transmittance[S], behind[S];
   Vec2<float> dL_dplace[F::kMoves ? S : 1];
-  int stopped[S];  ///< row of the log from which on the sample composited nothing
+  int stopped[S];  ///< event of the lane from which on the sample composited nothing
 
   __device__ RayAdjoint(const BlendVjpParams& params, const Pixel& pixel) {
     using Samples = LaneSamples<S, 1>;
@@ -119,45 +106,53 @@ template <class F, int C> struct RayAdjoint {
 
 template <class F, int C> class RayWalkBack {
  public:
-  __device__ RayWalkBack(const BlendVjpParams& params, const TileList& list, Vec2<float> p, float* of_lanes)
-      : params_(params), list_(list), p_(p), of_lanes_(of_lanes) {}
+  __device__ RayWalkBack(const BlendVjpParams& params, const TileList& list, Vec2<float> p, const LaneLog<F>& log)
+      : params_(params), list_(list), p_(p), log_(log) {}
 
-  /// Rows [begin, end) of the log, from the last to the first.
-  __device__ void run(const LaneLog<F>& log, int begin, int end, RayAdjoint<F, C>& adjoint) const {
-    Event next = {};
-    if (end > begin) load(log, end - 1, next);
-    for (int row = end - 1; row >= begin; --row) {
-      const Event event = next;
-      const bool any = event.entry.payload >= 0;
-      const Splat<F, float> splat = load_splat<F>(params_.splats, event.pair.splat);
-      if (row > begin) load(log, row - 1, next);  // while the splat is on its way
+  /// Events of each lane before `end`, from the last to the first, until one is lost. Returns how many are left.
+  __device__ int run(int end, RayAdjoint<F, C>& adjoint) const {
+    const int lost = max(end - log_.rows, 0);
+    const auto checked = [&](RayEvent event, int row) {
+      if (row < lost) event.distance = row < 0 ? RayEvent::kNone : RayEvent::kLost, event.pair = {0, -1};
+      return event;
+    };
+    RayEvent event = checked(log_.event(end - 1), end - 1), next = checked(log_.event(end - 2), end - 2);
+    const int value = summed_value<kRaySums<C>>(lane_id());
+    float* const sums = params_.pair_grads + (value < kPairMeans ? value : kPairFourthChannel);
+    for (;;) {
+      const int farthest = warp_max(event.distance);
+      if (farthest == RayEvent::kNone || farthest == RayEvent::kLost) return end;
+      const int lane = __ffs(int(__ballot_sync(kAllLanes, event.distance == farthest))) - 1;
+      const SlotPair pair = {shuffle(event.pair.splat, lane), shuffle(event.pair.slot, lane)};
+      const RayEvent after = log_.event(end - 3);  // used, and waited for, at the end
+      const Splat<F, float> splat = load_splat<F>(params_.splats, pair.splat);
+      const bool mine = event.pair.slot == pair.slot;
       float values[kRaySums<C>] = {};
       float means[2] = {0, 0};
-      if (any) add(event, splat, row, adjoint, values, means);
-      const int32_t to = any ? event.pair.slot : -1;
-      add_to_rows(of_lanes_, values, to, params_.pair_grads,
-                  [](int k) { return k < kPairMeans ? k : kPairFourthChannel; });
-      if (params_.mean_sums != MeanSums::kNone)
-        add_to_rows(of_lanes_, means, to, params_.pair_grads, [](int k) { return kPairMeans + k; });
+      if (mine) add(splat, pair.splat, end - 1, event.raw, adjoint, values, means);
+      const int64_t row = int64_t(pair.slot) * kPairGradWidth;
+      const float sum = sum_values(values);
+      if (has_value_first<kRaySums<C>>(lane_id())) atomicAdd(sums + row, sum);
+      if (params_.mean_sums != MeanSums::kNone) {
+        const float total = warp_sum_of_two(means[0], means[1]);
+        if (lane_id() % 16 == 0) atomicAdd(params_.pair_grads + row + kPairMeans + lane_id() / 16, total);
+      }
+      if (!mine) continue;
+      --end;
+      event = next;
+      next = checked(after, end - 2);
+      prefetch_splat(params_.splats, next.pair.splat);
+      if constexpr (F::kMoves) prefetch(&log_.places(end - 2));
     }
   }
 
  private:
   static constexpr int S = F::kSamples;
-  struct Event {
-    RayEntry entry;
-    SlotPair pair;
-    Vec2<float> places[F::kMoves ? S : 1];  ///< before the splat
-  };
 
-  __device__ void load(const LaneLog<F>& log, int row, Event& event) const {
-    log.get(row, event.entry, event.places);
-    event.pair = reinterpret_cast<const SlotPair*>(list_.pairs)[max(event.entry.payload, 0)];
-  }
-
-  __device__ void add(const Event& event, const Splat<F, float>& splat, int row, RayAdjoint<F, C>& to,
+  /// Event `row` of the lane, of splat `id`. `logged`: its raw.
+  __device__ void add(const Splat<F, float>& splat, int32_t id, int row, float logged, RayAdjoint<F, C>& to,
                       float (&values)[kRaySums<C>], float (&means)[2]) const {
-    const Values<C> channels = channels_of<C>(params_.channels, splat, event.pair.splat);
+    const Values<C> channels = channels_of<C>(params_.channels, splat, id);
     float g_color = 0, contribution = 0, weighted = 0;
     AR_UNROLL for (int c = 0; c < C; ++c) g_color = madd(to.gradient.v[c], channels.v[c], g_color);
     const auto terms = tile_terms(splat, list_);
@@ -165,20 +160,22 @@ template <class F, int C> class RayWalkBack {
     if constexpr (F::kMoves) {
       LeavingSplat<F> leaving = {};
       leaving.set(splat, list_, p_);
+      const typename LaneLog<F>::Places places = log_.places(row);
       MovingBlendGrad<float> grad = no_moving_blend_grad<float>();
       AR_UNROLL for (int s = 0; s < S; ++s) {
+        const Vec2<float> place = places.of[s];
         Vec2<float> at;
-        const float seen = leaving.raw(p_, s, event.places[s], at);
+        const float seen = leaving.raw(p_, s, place, at);
         const float raw = composited(seen, row, to.stopped[s]) ? seen : 0;
-        add_placed_sample_vjp<F>(terms, at, raw, F::template cell<float>(s), g_color, event.places[s],
-                                 to.transmittance[s], to.behind[s], to.dL_dplace[s], grad);
+        add_placed_sample_vjp<F>(terms, at, raw, F::template cell<float>(s), g_color, place, to.transmittance[s],
+                                 to.behind[s], to.dL_dplace[s], grad);
       }
       contribution = grad.contribution;
       weighted = grad.of_splat.weighted;
       shape = grad.of_splat.sums;
     } else {
       AR_UNROLL for (int s = 0; s < S; ++s) {
-        const float raw = kKeepsRaw<F> ? event.entry.raw : F::alpha(terms, p_, s);
+        const float raw = kLogsRaw<F> ? logged : F::alpha(terms, p_, s);
         const BlendGrad<float> grad =
             blend_sample_vjp(composited(raw, row, to.stopped[s]), raw, g_color, to.transmittance[s], to.behind[s]);
         F::add_alpha_vjp(terms, p_, s, grad.of_alpha, shape);
@@ -203,37 +200,44 @@ template <class F, int C> class RayWalkBack {
   const BlendVjpParams& params_;
   const TileList& list_;
   const Vec2<float> p_;
-  float* const of_lanes_;
+  const LaneLog<F>& log_;
 };
 
-/// Composites the tile, up to row `end` of the log. Returns the rows that the warp has logged.
-template <class F, class Shared, class Adjoint>
-__device__ int log_rays(const BlendVjpParams& params, const TileList& list, Shared& shared, Vec2<float> p,
-                        RaySamples<F>& samples, const LaneLog<F>& log, int end, Adjoint& adjoint) {
+/// Composites half of the tile, each lane up to event `end`. Returns the events that the lane has logged.
+template <class F, class Adjoint>
+__device__ int log_rays(const BlendVjpParams& params, const TileList& list, int half, RaySamples<F>& samples,
+                        const LaneLog<F>& log, int end, Adjoint& adjoint) {
   constexpr int S = F::kSamples, kAtOnce = RayPolicy::kAtOnce<F>;
+  auto& stage = *reinterpret_cast<RayStage<F>*>(dynamic_shared());
+  const Vec2<float> p = ray_pixel(half);
   int row = 0;
   walk_rays<F>(
-      params, list, shared.stage, reinterpret_cast<float*>(&shared + 1), p, samples.open(),
+      params, list, stage, reinterpret_cast<RayEntry*>(&stage + 1), half, samples.open(),
       [](int place, int32_t) { return place; },
       [&](const RayEntry(&entries)[kAtOnce]) {
+        SlotPair pairs[kAtOnce];
+        LeavingSplat<F> leaving[kAtOnce] = {};
         AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
-          const RayEntry& entry = entries[i];
-          if (!__any_sync(kAllLanes, entry.payload >= 0)) continue;
-          if (row == end) return false;
-          LeavingSplat<F> leaving = {};
-          if constexpr (!kKeepsRaw<F>)
-            leaving.set(load_splat<F>(params.splats, list.splat(max(entry.payload, 0))), list, p);
-          Vec2<float> before[F::kMoves ? S : 1];
+          const int place = max(entries[i].payload, 0);  // any splat, for lanes that have none
+          pairs[i] = reinterpret_cast<const SlotPair*>(list.pairs)[place];
+          leaving[i].set(load_splat<F>(params.splats, pairs[i].splat), list, p);
+        }
+        AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
+          typename LaneLog<F>::Places before;
           if constexpr (F::kMoves) {
-            AR_UNROLL for (int s = 0; s < S; ++s) before[s] = samples.places[s];
+            AR_UNROLL for (int s = 0; s < S; ++s) before.of[s] = samples.places[s];
           }
           bool any = false;
+          float raw = 0;  // of the last sample
           AR_UNROLL for (int s = 0; s < S; ++s) {
+            if (row == end) samples.transmittance[s] = -1;
             const bool open = samples.transmittance[s] > 0;
-            any |= blend_leaving(leaving, entry, p, s, samples).mask;
+            any |= blend_leaving(leaving[i], entries[i], p, s, samples, raw).mask;
             if (open & (samples.transmittance[s] < 0)) adjoint.stopped[s] = row;
           }
-          log.put(row, any ? entry.payload : -1, entry, before);
+          if (!any) continue;
+          log.put(row, {entries[i].depth, pairs[i], raw});
+          if constexpr (F::kMoves) log.places(row) = before;
           ++row;
         }
         return samples.open();
@@ -241,47 +245,35 @@ __device__ int log_rays(const BlendVjpParams& params, const TileList& list, Shar
   return row;
 }
 
-/// C: as in blend_rays. Each block claims tiles until none is left.
+/// C: as in blend_rays. Each block, a warp, claims tiles until none is left.
 template <class F, int C>
-__global__ void __launch_bounds__(kRayThreads, blocks_per_sm(RayPolicy::kVjpBlocks<F>, kRayThreads))
-    blend_rays_vjp_kernel(const BlendVjpParams params) {
+__global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_vjp_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples;
-  auto& shared = *reinterpret_cast<RayVjpShared<F, C>*>(dynamic_shared());
-  const int warp = threadIdx.x / 32;
-  const Vec2<float> p = RayBoxes::pixel();
+  constexpr int S = F::kSamples, kAll = std::numeric_limits<int>::max();
   const LaneLog<F> log(params.ray_log);
   for (;;) {
-    __syncthreads();
-    if (threadIdx.x == 0) shared.chunk = atomicAdd(params.chunks_taken, 1);
-    __syncthreads();
-    const int tile = listed_tile(params, shared.chunk);
+    int taken = 0;
+    if (lane_id() == 0) taken = atomicAdd(params.chunks_taken, 1);
+    const int tile = listed_tile(params, shuffle(taken, 0));
     if (tile < 0) return;
     const TileList list = list_of(params.lists, params.grid, tile);
-    for (int k = threadIdx.x; k < list.count && !list.of_patch; k += kRayThreads) clear_pair(params, list.slot(k));
-    const Pixel pixel(list, params.grid, p);
-    const RayWalkBack<F, C> back(params, list, p, shared.of_lanes);
-    RayAdjoint<F, C> adjoint(params, pixel);
-    // `turn`: of this warp the rows up to `end` are left; -1: none has a log yet.
-    for (int turn = -1, end = kWholeList; turn < kRayWarps;) {
-      RaySamples<F> samples(pixel.inside && (turn < 0 || turn == warp));
-      const int rows = log_rays<F>(params, list, shared, p, samples, log, end, adjoint);
-      if (turn < 0) {
-        AR_UNROLL for (int s = 0; s < S; ++s) adjoint.transmittance[s] = abs(samples.transmittance[s]);
-        if (lane_id() == 0) shared.rows[warp] = rows;
-      }
-      __syncthreads();
-      if (turn < 0) turn = 0, end = shared.rows[0];
-      while (turn < kRayWarps) {
-        const int begin = max(end - params.ray_log.rows, 0);
-        if (turn == warp) back.run(log, begin, end, adjoint);
-        __syncthreads();
-        end = begin;
-        if (end > 0) break;
-        if (++turn < kRayWarps) end = shared.rows[turn];
+    for (int k = lane_id(); k < list.count && !list.of_patch; k += 32) clear_pair(params, list.slot(k));
+    __syncwarp();  // before other lanes add
+    for (int half = 0; half < kRayHalves; ++half) {
+      const Vec2<float> p = ray_pixel(half);
+      const Pixel pixel(list, params.grid, p);
+      RayAdjoint<F, C> adjoint(params, pixel);
+      const RayWalkBack<F, C> back(params, list, p, log);
+      for (int end = kAll; __any_sync(kAllLanes, end > 0);) {
+        RaySamples<F> samples(pixel.inside && end > 0);
+        const int events = log_rays<F>(params, list, half, samples, log, end, adjoint);
+        if (end == kAll) {
+          AR_UNROLL for (int s = 0; s < S; ++s) adjoint.transmittance[s] = abs(samples.transmittance[s]);
+        }
+        end = back.run(events, adjoint);
       }
     }
   }
 }
 
-}  // namespace ar::cuda::by_blocks
+}  // namespace ar::cuda

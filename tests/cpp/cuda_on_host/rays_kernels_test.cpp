@@ -119,15 +119,12 @@ template <class F, int C> Results run(const Scene<F>& scene, Way way) {
   vjp.chunks_taken = &chunks_taken;
   vjp.mean_sums = MeanSums::kAbsolute;
   vjp.order = blend.order;
-  std::vector<uint32_t> words(size_t(kBlocks * by_blocks::kRayWarps * way.log_rows * 32 * by_blocks::kLogWords<F>),
-                              0x7fc00000);
+  std::vector<uint32_t> words(size_t(kBlocks * way.log_rows * 32 * kLogWords<F>), 0x7fc00000);
   vjp.ray_log = {words.data(), kBlocks, way.log_rows};
   const size_t rows = way.overflow ? count : pairs.size();
   std::vector<float> pair_grads(rows * kPairGradWidth, way.overflow ? 0 : NAN);
   vjp.pair_grads = pair_grads.data();
-  EXPECT_LE(int64_t(sizeof(by_blocks::RayVjpShared<F, C>)) + by_blocks::RayWindow<F>::bytes(way.window),
-            int64_t(sizeof dynamic_memory));
-  cuda_on_host::launch(kBlocks, by_blocks::kRayThreads, [&] { by_blocks::blend_rays_vjp_kernel<F, C>(vjp); });
+  cuda_on_host::launch(kBlocks, 32, [&] { blend_rays_vjp_kernel<F, C>(vjp); });
   out.sums.assign(count, std::vector<float>(kPairGradWidth));
   for (size_t row = 0; row < rows; ++row) {
     for (int k = 0; k < kPairGradWidth; ++k) out.sums[row % count][k] += pair_grads[row * kPairGradWidth + k];
@@ -316,7 +313,6 @@ TYPED_TEST(RaysKernels, ShareLists) {
 TYPED_TEST(RaysKernels, FitIntoSharedMemory) {
   using F = TypeParam;
   EXPECT_LE(int64_t(sizeof(RayStage<F>)) + RayWindow::bytes(kMaxRayWindow), 64 * 1024);
-  EXPECT_LE(int64_t(sizeof(by_blocks::RayVjpShared<F, 4>)) + by_blocks::RayWindow<F>::bytes(kMaxRayWindow), 64 * 1024);
 }
 
 }  // namespace
