@@ -149,3 +149,27 @@ def test_lenses(device, best, lens, footprint):
         slope = torch.linalg.solve(spread, du.T @ dz / len(points))
         # v = 1e-4 px^2 is small beside Sigma_uv, and 4000 samples know a covariance to a few percent.
         assert (slope - splats.slopes[k]).norm() < 0.1 * (splats.slopes[k].norm() + 0.02)
+
+
+@pytest.mark.parametrize("length, kept", [(1e16, True), (1e17, False)])
+def test_the_slope_of_a_needle_seen_end_on(length, kept):
+    """Beyond 1e18 world units per px, where depths could overflow, it is zero.
+
+    The needle ends d px beside its centre in the picture. Its variance there is d^2 + v: with d^2 = v = 1e-4 px^2, the
+    steepest tilt, the slope is length d / (2 v) = 50 length.
+    """
+    camera = scenes.Camera(image_height=19, image_width=23).facing_z()
+    distance = 4.0
+    tilt = 0.01 * distance / (camera.image_height / (2 * camera.tanfovy) * length)
+    scene = {
+        "means3D": torch.tensor([[0, 0, distance]]),
+        "scales": torch.tensor([[0.05, 1e-5, length]]),
+        "rotations": torch.tensor([[1, tilt / 2, 0, 0]]),
+        "opacities": torch.tensor([[0.9]]),
+        "colors_precomp": torch.ones(1, 3),
+    }
+    settings = camera.settings(torch.float32, variant=("point", {}), effects=ar.Effects(order=RAY))
+    slope = ar.project(settings, **scene).slopes[0]
+    assert slope[0] == 0
+    assert slope[1] == pytest.approx(-50 * length, rel=0.01) if kept else slope[1] == 0
+    assert ar.GaussianRasterizer(settings)(means2D=None, **scene)[0].max() > 0.8
