@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import ops  # noqa: F401  (registers the fake kernels)
+from ..checks import check_value, plain_value
 from ..gaussians import Gaussians
 from ..optim import clear_moments, parameter_index
 from ..relocation import compute_relocation
 from .control import FixedDensity, normal_numbers, passes
-from .options import MonteCarloOptions, options_of
+from .options import USUAL_EXTENT, MonteCarloOptions, options_of
 
 _add_noise = torch.ops.analytic_rasterizer.add_noise_.default
 
@@ -27,10 +29,12 @@ class MonteCarloDensity(FixedDensity):
 
     Args:
         options: None: the defaults.
+        extent: Of the scene, world units. The noise grows with the cube of lengths, so that it is divided by the square
+            of `extent` over the default: a scene in other units is moved alike. With the default it is the paper's.
         others: As of `FixedDensity`.
 
     Raises:
-        TypeError, ValueError: As of `FixedDensity`.
+        TypeError, ValueError: As of `FixedDensity`; the extent is not positive and finite.
     """
 
     def __init__(
@@ -38,9 +42,12 @@ class MonteCarloDensity(FixedDensity):
         gaussians: Gaussians,
         optimizer: torch.optim.Optimizer,
         options: MonteCarloOptions | None = None,
+        extent: float = USUAL_EXTENT,
         **others: Any,
     ):
         self.options = options_of(MonteCarloOptions, options)
+        self.extent = plain_value("extent", extent, float)
+        check_value("extent", 0 < self.extent < math.inf, "positive and finite", extent)
         super().__init__(gaussians, optimizer, **others)
 
     @torch.no_grad()
@@ -99,7 +106,7 @@ class MonteCarloDensity(FixedDensity):
         """Moves means at random, along with their covariance, the more the more transparent they are [MCMC, Eq. 8]."""
         means = self.gaussians.means
         group, _ = parameter_index(self.optimizer, "means", means)
-        strength = self.options.noise * float(group["lr"])
+        strength = self.options.noise * float(group["lr"]) * (USUAL_EXTENT / self.extent) ** 2
         _add_noise(*self.gaussians[:4], normal_numbers(means, self.generator), strength)
 
 

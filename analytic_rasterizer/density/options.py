@@ -7,6 +7,8 @@ from typing import Any
 
 from ..declared import NOT_NEGATIVE, POSITIVE, SHARE, Options, Range, at_least, described, option
 
+USUAL_EXTENT = 5.0
+"""World units: the extent of the scenes for which noise and weight of scales are told, as of Mip-NeRF 360's."""
 OPACITY = Range(lambda value: 0 <= value < 1, "at least 0 and below 1")
 
 

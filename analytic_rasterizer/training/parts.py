@@ -270,7 +270,10 @@ class LossOptions(Options):
         -1.0, 'Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.', WEIGHT, metavar="WEIGHT"
     )
     scale_weight: float = option(
-        -1.0, 'Weight of the mean scale in the loss; -1: 0.01 for "mcmc", otherwise 0.', WEIGHT, metavar="WEIGHT"
+        -1.0,
+        'Weight of the mean scale in the loss, in fifths of the extent; -1: 0.01 for "mcmc", otherwise 0.',
+        WEIGHT,
+        metavar="WEIGHT",
     )
     depth: str = option(
         "none",

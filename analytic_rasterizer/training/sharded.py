@@ -24,6 +24,7 @@ from ..distributed.cameras import agreed_step
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..optim import MOMENTS
+from .control import regularizers_of
 from .counting import COUNTED
 from .extent import extent_of
 from .rendering import enlarged
@@ -140,7 +141,7 @@ class ShardedTrainer(Trainer):
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
         """
         options, shown = self.options, self._next()
-        shapes = Shapes(self.gaussians, self.filter_3d, options.regularizers, self.count)
+        shapes = Shapes(self.gaussians, self.filter_3d, regularizers_of(options, self.extent), self.count)
         step, _ = agreed_step(
             [enlarged(picture.settings, options.supersampling) for picture in shown],
             self.gaussians.means,

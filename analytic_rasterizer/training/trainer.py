@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import _C
-from ..density import FixedDensity, GradientDensity, MonteCarloDensity, MonteCarloOptions
+from ..density import GradientDensity
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
@@ -20,6 +20,7 @@ from ..render.arguments import camera_arguments
 from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
 from .captures import WHITE
+from .control import make_density, regularizers_of
 from .corrections import Corrections
 from .counting import Counting, no_rows
 from .depth_targets import Targets
@@ -293,7 +294,7 @@ class Trainer:
     def _differentiate_picture(self, shown: Shown) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The loss of a picture with the regularizers, its radii, and gradients in the order of `picture_gradients`."""
         options = self.options
-        opacity_weight, scale_weight = options.regularizers
+        opacity_weight, scale_weight = regularizers_of(options, self.extent)
         compared = self._comparison(shown)
         given = {
             "mean_columns": self.density.columns if self._watches(shown.scale) else 0,
@@ -427,22 +428,3 @@ class Trainer:
         # Checkpoints of earlier versions have neither.
         self.extent = self.density.extent = state.get("extent", self.extent)
         self.dropped = state.get("dropped", 0)
-
-
-def make_density(
-    options: TrainingOptions,
-    gaussians: Gaussians,
-    optimizer: torch.optim.Optimizer,
-    extent: float,
-    white_background: bool = False,
-    ranks: Ranks = ALONE,
-    extra: dict[str, Tensor] | None = None,
-) -> FixedDensity:
-    """The density control that `options.density` names, with what the options say about it."""
-    told, common = options.control, {"seed": options.seed, "ranks": ranks, "extra": extra}
-    if told is None:
-        return FixedDensity(gaussians, optimizer, **common)
-    if isinstance(told, MonteCarloOptions):
-        return MonteCarloDensity(gaussians, optimizer, told, **common)
-    told = replace(told, white_background=white_background)
-    return GradientDensity(gaussians, optimizer, extent, told, **common)

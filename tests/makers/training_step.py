@@ -10,6 +10,7 @@ from torch.nn.functional import avg_pool2d, huber_loss
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.losses import l1_ssim
+from analytic_rasterizer.training.control import regularizers_of
 
 # Relative, by the norm: the rounding of a variance in SSIM, 2^-24 over its constant 9e-4, is 7e-5 of a gradient.
 TOLERANCE = 3e-4
@@ -91,7 +92,7 @@ def by_autograd(trainer) -> dict[str, torch.Tensor]:
             how["vignetting"] = falloffs.setdefault(shown.view, how["vignetting"].clone().requires_grad_())
         how["depth"] = trainer._depth(shown) or None
         losses.append(compared(shown.settings._replace(**size), shown_as, leaves[-1], target, **how)[0])
-    opacity_weight, scale_weight = options.regularizers
+    opacity_weight, scale_weight = regularizers_of(options, trainer.extent)
     penalty = opacity_weight * arguments["opacities"].mean() + scale_weight * arguments["scales"].mean()
     loss = torch.stack(losses).mean() + penalty
     loss.backward()

@@ -11,7 +11,8 @@ from analytic_rasterizer.cameras.rotations import rotation_matrices
 from analytic_rasterizer.density import gradient, monte_carlo
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
-from analytic_rasterizer.training import TrainingOptions, trainer
+from analytic_rasterizer.training import TrainingOptions
+from analytic_rasterizer.training import control as of_training
 from analytic_rasterizer.training import rendering as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default
@@ -44,7 +45,7 @@ def make_control(sizes, opacities, white_background=False, device="cpu", **optio
         field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
     optimizer.step()
     options = TrainingOptions.preset("3dgs", **options)
-    return trainer.make_density(options, gaussians, optimizer, EXTENT, white_background)
+    return of_training.make_density(options, gaussians, optimizer, EXTENT, white_background)
 
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
@@ -379,10 +380,28 @@ def test_noise_follows_the_covariance_and_spares_the_opaque():
     control.after_step(1, 0.0)
     moved = (control.gaussians.means.detach() - before) @ rotation_matrices(turn)  # in the Gaussian's frame
     transparent, opaque = moved.split(count // 2)
-    strength = 5.0 * rate * torch.sigmoid(torch.tensor(100 * (0.005 - 0.001)))
+    strength = 5.0 * rate * (5 / EXTENT) ** 2 * torch.sigmoid(torch.tensor(100 * (0.005 - 0.001)))
     # 2.5% is five standard deviations of the estimate from 10,000; the step before moved opacities by 0.1%.
     torch.testing.assert_close(transparent.std(0), strength * scales**2, rtol=0.03, atol=0)
     assert opaque.abs().max() < 1e-6
+
+
+def test_mcmc_trains_alike_in_other_units():
+    """Millimetres in place of metres: noise and gradients of the regularizers, as shares of the lengths."""
+    moved, weights = [], []
+    for unit in (1.0, 1000.0):
+        gaussians = make_gaussians([0.3 * unit] * 50, [0.1] * 50)
+        optimizer = FusedAdam([{"params": [field]} for field in gaussians], lr=1e-3 * unit, eps=1e-15)
+        options = TrainingOptions(density="mcmc")
+        control = of_training.make_density(options, gaussians, optimizer, 2.0 * unit)
+        before = control.gaussians.means.detach().clone()
+        control.after_step(1, 0.0)
+        moved.append((control.gaussians.means.detach() - before) / unit)
+        opacity_weight, scale_weight = of_training.regularizers_of(options, 2.0 * unit)
+        weights.append((opacity_weight, scale_weight * unit))  # times a mean scale in metres
+    assert moved[0].norm() > 0.1
+    torch.testing.assert_close(*moved, rtol=1e-4, atol=1e-5)
+    assert weights[0] == pytest.approx(weights[1]) == (0.01, 0.025)
 
 
 def test_draws_follow_the_weights(device):

@@ -231,7 +231,7 @@ def test_steps_at_which_the_number_may_change(steps, options):
     parameters = parameters.map(lambda field: field.requires_grad_())
     optimizer = torch.optim.Adam([{"params": [field]} for field in parameters])
     options = TrainingOptions(iterations=steps, prune_opacity=0.0, **options)
-    control = training.trainer.make_density(options, parameters, optimizer, 1.0)
+    control = training.control.make_density(options, parameters, optimizer, 1.0)
     changed = [step for step in range(1, steps + 1) if control.after_step(step, step / steps)]
     assert isinstance(control, GradientDensity) and changed == list(schedule.changes_at(options, steps))
 
