@@ -259,8 +259,10 @@ def test_four_channels(variant):
     assert max(relative_error(*pair) for pair in zip(*made)) < 1e-10
 
 
-def test_equal_depths_by_index(device, best):
-    """Of equal splats the first is in front; so are equal depths of different splats at the pixel."""
+@pytest.mark.parametrize("window", [1, 2, 24])
+def test_equal_depths_by_index(device, best, window, with_window):
+    """Of equal splats the first is in front, also where a window is full."""
+    with_window(window)
     camera = Camera(image_height=1, image_width=1).facing_z()
     scene = scenes.splat_scene(camera, [[0.0, 0.0]] * 3, [25.0, 0, 25.0], [0.5] * 3, [2.0] * 3, torch.eye(3).double())
     color, _ = camera.render(scenes.cast(scene, best, device), ("point", {}), effects=RAYS)
