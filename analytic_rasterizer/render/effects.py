@@ -184,7 +184,7 @@ class Effects:
         order: In which order a pixel composites splats: "center", by the depth of their centres; "ray", by the depth at
             which its ray is densest in them, so that nothing pops when the camera moves; "ray:32", the same nearer to
             the exact order (`ORDERS`). With the last two at most 4 channels are blended, not every footprint can be
-            used, and medians, dominant Gaussians and statistics cannot be made. The CPU only.
+            used, and medians, dominant Gaussians and statistics cannot be made. Several times as slow.
 
     Raises:
         TypeError: A wrong type.

@@ -101,7 +101,7 @@ class SceneOptions(Options):
         CENTER,
         'Order of splats: "center", by the depth of their centres; or along the rays of pixels, so that nothing pops '
         'when the camera moves: "ray", or "ray:32", which is nearer to the exact order. The last two take several '
-        "times as long, and run on the CPU only.",
+        "times as long.",
         one_of(ORDERS),
         main=True,
     )
