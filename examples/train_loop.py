@@ -2,10 +2,10 @@
 
     python examples/train_loop.py OUT [FOLDER]
 
-trains on the capture in FOLDER (NeRF-synthetic, COLMAP or nerfstudio), or on pictures that it makes itself, writes
-OUT/scene.ply, which says for which footprint it is, and prints the PSNR of the training pictures. Runs on CUDA where
-there is a device, otherwise on the CPU.
-Needs `pip install ".[train]"`.
+trains on the capture in FOLDER (NeRF-synthetic, COLMAP or nerfstudio), or on pictures that it makes itself. Writes
+OUT/scene.ply, which says for which footprint it is, and the training views OUT/cameras.json, so that the commands
+`render` and `view` show OUT; `evaluate` needs `--data FOLDER`. Prints the PSNR of the training pictures. Runs on CUDA
+where there is a device, otherwise on the CPU. Needs `pip install ".[train]"`.
 """
 
 import math
@@ -78,6 +78,7 @@ def main(out, folder=None):
     gaussians, losses = train(pictures, points, steps, options)
     Path(out).mkdir(parents=True, exist_ok=True)
     io.save_scene(Path(out) / "scene.ply", gaussians, io.SceneMetadata(footprint=FOOTPRINT))
+    io.save_views(Path(out) / "cameras.json", pictures.views)
     psnr = training.evaluate(gaussians, pictures, FOOTPRINT)["mean"]["psnr"]
     print(f"{gaussians.count} Gaussians, loss {losses[0]:.3f} to {losses[-1]:.3f}, PSNR {psnr:.2f} dB")
 

@@ -413,7 +413,9 @@ def test_example_writes_a_scene(capture, tmp_path, monkeypatch, capsys):
     train_loop.main(tmp_path / "out", capture)
     assert given == [(7000, 100_000)]
     assert io.load_scene(tmp_path / "out" / "scene.ply").count == 200
-    choice = io.find_scene(tmp_path / "out" / "scene.ply").choose_footprint()
+    found = io.find_scene(tmp_path / "out")  # as `render` and `view` do
+    assert len(found.load_views()) == 4
+    choice = found.choose_footprint()
     assert str(choice.footprint) == train_loop.FOOTPRINT and choice.reason == "scene.ply says so"
     assert capsys.readouterr().out.startswith("200 Gaussians, loss ")
 
