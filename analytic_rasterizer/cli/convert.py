@@ -25,11 +25,11 @@ def add_parser(subcommands) -> None:
     add_scene_file(parser)
     add = parser.add_argument
     add("out", metavar="OUT", help=f"the file to write: {WRITTEN_IN_WORDS}")
-    three = "three letters for x, y and z: right or left, down or up, forward or back"
+    three = "three letters: r or l (right, left) for x, d or u (down, up) for y, f or b (forward, back) for z"
     usual = "luf for glTF, rub for OpenUSD"
     wanted = f"axes of OUT, {three} (default: {usual}, else rdf)"
     add("--axes", type=str.lower, choices=AXES, metavar="XYZ", help=wanted)
-    said = f"axes of SCENE (default: those it says, else rub for .spz, {usual}, else rdf)"
+    said = f"axes of SCENE, as of --axes (default: those it says, else rub for .spz, {usual}, else rdf)"
     add("--scene-axes", type=str.lower, choices=AXES, metavar="XYZ", help=said)
     degrees = range(MAX_SH_DEGREE + 1)
     add("--sh-degree", type=int, choices=degrees, metavar="N", help="leave out harmonics of higher degrees")

@@ -52,7 +52,7 @@ def add_parser(subcommands) -> None:
     add("scene", metavar="SCENE", help="folder of pictures with cameras, or without; or a film")
     add("--out", required=True, metavar="DIR", help="folder for the results")
     add_reading(parser, "SCENE")  # what is not given is None, for --resume
-    add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
+    add("--points", metavar="FILE", help="start from this: a scene of any format, or a .ply of points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, with its options")

@@ -48,7 +48,8 @@ def about_film(path: Path) -> tuple[int, tuple[int, int], str]:
     """How many photographs are taken of a film, their size in px, and both in words. Raises as `opened_film`."""
     with opened_film(path) as (_, known):
         pictures, count = counts_of(known)
-    told = f"a film of {known['duration']:.1f} s: the sharpest picture of each {pictures / count:.3g} is taken, {count}"
+    each = f"{count} photographs, of each {known['duration'] / count:.3g} s the sharpest of {pictures / count:.3g}"
+    told = f"a film of {known['duration']:.1f} s: {each} pictures"
     return count, tuple(known["size"]), told
 
 

@@ -94,7 +94,7 @@ def test_a_film_becomes_a_capture(tmp_path, capsys, monkeypatch):
     frames = (torch.from_numpy(draw(view)).permute(2, 0, 1) / 255 for view in views)
     io.save_video(tmp_path / "film.mp4", frames, SIZE, fps=6)
     assert commands.command("inspect", tmp_path / "film.mp4") == 0
-    assert "a film of 4.0 s: the sharpest picture of each 3 is taken, 8" in capsys.readouterr().out
+    assert "a film of 4.0 s: 8 photographs, of each 0.5 s the sharpest of 3 pictures" in capsys.readouterr().out
     found = reconstruct(tmp_path / "film.mp4", tmp_path / "capture")
     names = sorted(path.name for path in (tmp_path / "capture" / "images").iterdir())
     assert len(names) == 8 and names[0].startswith("frame_0000")
