@@ -105,6 +105,9 @@ def find_photographs(source, images: str | None = None, masks: str | None = None
         source: The folder or the film.
         images: The folder of photographs in it; None: "images" where that is there.
         masks: "none": masks are not looked for.
+
+    Raises:
+        io.SceneError: A folder with a film, and without photographs.
     """
     source = Path(source)
     if is_film(source):
@@ -120,6 +123,9 @@ def find_photographs(source, images: str | None = None, masks: str | None = None
     # Masks beside the pictures; a name that all have is that of what they show.
     files = [path for path in files if not MASK_FILE.search(path.stem)] or files
     if not files:
+        films = sorted(path for path in folder.iterdir() if is_film(path))
+        if films:
+            raise io.SceneError(f"{source}: expected photographs, got a film: give the file itself, {films[0]}")
         return None
     names = tuple(in_order([path.relative_to(folder).as_posix() for path in files]))
     found = Photographs(source, folder, names)

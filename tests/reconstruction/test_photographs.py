@@ -117,6 +117,15 @@ def test_captures_and_empty_folders_are_no_photographs(tmp_path, capture):
     assert find_photographs(tmp_path / "elsewhere") is None  # an error of loaders says where the cameras are
 
 
+def test_a_film_in_a_folder_is_named(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "walk.MP4").write_bytes(b"")
+    for command in (["inspect"], ["train", "--out", tmp_path / "out"]):
+        assert commands.command(command[0], tmp_path / "photos", *command[1:]) == 2
+        said = f"photos: expected photographs, got a film: give the file itself, {tmp_path / 'photos' / 'walk.MP4'}"
+        assert said in capsys.readouterr().err
+
+
 def test_exif_says_camera_and_position(tmp_path):
     for name, size, exif in (
         ("a.jpg", SIZE, exif_of(4.25, -47, 8)),
