@@ -46,6 +46,11 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
 def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], Any]:
     """What `load_views` returns, with the content of the file. Raises as that does."""
     path = Path(path)
+    if path.is_dir():
+        raise SceneError(
+            f"{path}: expected a file of views, got a folder",
+            "of a capture, io.save_views(FILE, [item.view for item in training.load_capture(FOLDER).train]) writes one",
+        )
     check_content(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"))

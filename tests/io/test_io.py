@@ -470,7 +470,7 @@ def test_views_that_cannot_be_used(tmp_path, data, message):
 def test_views_file_that_is_not_there(tmp_path):
     with pytest.raises(io.SceneError, match=r"none\.json: No such file"):
         io.load_views(tmp_path / "none.json")
-    with pytest.raises(io.SceneError, match="Is a directory"):
+    with pytest.raises(io.SceneError, match="expected a file of views, got a folder"):
         io.load_views(tmp_path)
 
 
