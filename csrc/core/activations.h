@@ -1,5 +1,5 @@
-// The activations of 3DGS for one Gaussian: exp of scales, unit quaternions, sigmoid of opacities. Also their penalty,
-// a regulariser of the loss, and the 3D filter.
+// The activations of 3DGS: exp of scales, unit quaternions, sigmoid of opacities. Also their penalty in the loss, and
+// the 3D filter.
 #pragma once
 
 #include <cmath>
@@ -9,7 +9,7 @@
 
 namespace ar {
 
-/// The least divisor of a quaternion, as in torch.nn.functional.normalize.
+/// As in torch.nn.functional.normalize.
 inline constexpr double kMinQuaternionLength = 1e-12;
 
 /// Of a penalty: weighted sums over all Gaussians and their axes.
@@ -103,7 +103,7 @@ template <typename T> AR_HD void activate_vjp(const ActivateVjpParams<T>& p, int
     by_scales += {by_scale, by_scale, by_scale};
     by_opacity += *p.dL_dpenalty * p.weights.opacity;
   }
-  // Without a gradient zero, also where the value is infinite.
+  // Zero without a gradient, also where the value is infinite.
   if (p.dL_dlog_scales) {
     const bool given = p.dL_dscales || p.dL_dpenalty;
     p.dL_dlog_scales[i] = given ? mul(by_scales, scale_of(p.log_scales[i])) : Vec3<T>{};

@@ -1,6 +1,5 @@
-// Which pixels and tiles a splat can touch: Support, the ellipse of a splat with exact extents, and BoxReach, a cheaper
-// test for boxes of pixels (docs/internals/numerics.md, "Extents of the support"). Extents cull splats and find their
-// tiles, blending tests boxes.
+// Which pixels and tiles a splat can touch: Support, an ellipse with exact extents, which culls splats and finds tiles;
+// and BoxReach, a cheaper test of boxes of pixels, for blending (docs/internals/numerics.md, "Extents of the support").
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -65,7 +64,7 @@ template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
   return {s.mean.y - half, s.mean.y + half};
 }
 
-/// Exact extent in x of the part with y in [y0, y1].
+/// Exact extent in x where y is in [y0, y1].
 template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) {
   const T height = s.half_height, zero = T(0);
   const T lo = max(y0 - (s.mean.y + s.reach), -height), hi = min(y1 - (s.mean.y - s.reach), height);
@@ -77,8 +76,8 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// Without division and root: in z = w (x - mean) the ellipse is a circle, compared with a bounding box of the box. It
-/// may say yes if the ellipse passes closely.
+/// Without division and root: in z = w (x - mean) the ellipse is a circle, compared with a bounding box of the box.
+/// Near the ellipse it may say yes.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
@@ -131,7 +130,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// Keys of the sort: unsigned integers in the order of depths >= 0. -0 counts as 0.
+/// Unsigned integers in the order of depths >= 0. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
@@ -143,9 +142,8 @@ template <typename T> AR_HD auto depth_bits(T depth) {
 /// Tiles among 8x8: bit 8 r + c is row r, column c.
 using TileMask = uint64_t;
 
-/// The mask begins at `row` and `column`.
 struct TileBox {
-  TileMask mask;  ///< 0 if there is no tile, or one outside these 8x8
+  TileMask mask;  ///< from (row, column) on; 0 if there is no tile, or one outside
   int row, column, count;
 };
 template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGrid grid) {

@@ -1,4 +1,4 @@
-// Compositing one splat into one sample, and its adjoint (docs/internals/numerics.md, "Blending and its adjoint").
+// One splat in one sample, and the adjoint (docs/internals/numerics.md, "Blending and its adjoint").
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.
@@ -68,7 +68,7 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// By the position `place` of a sample that moves, within `cell` (Bounds or UnitCell), and its whitened coordinates z.
+/// Of a sample that moves, at `place` in `cell` (Bounds or UnitCell), with whitened coordinates z.
 template <class P, class Terms, class V, class Cell>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
@@ -97,7 +97,7 @@ template <class V> struct BlendGrad {
   AlphaGrad<V> of_alpha;  ///< zero where alpha is capped
 };
 
-/// Adjoint of blend_sample, called from the last splat to the first.
+/// Adjoint of blend_sample, last splat first.
 ///
 /// `g_color`: the pixel's gradient times the splat's colour. `behind` (B of docs/internals/numerics.md) is that product
 /// for all later splats and the background, seen through this splat alone. It and `transmittance` are read as after the

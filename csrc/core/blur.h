@@ -1,5 +1,4 @@
-// Adds the Blur of lens and shutter to a projected covariance, and lowers the amplitude, to keep the splat's mass. And
-// the adjoint.
+// Adds the Blur to a projected covariance, and lowers the amplitude, to keep the splat's mass. And the adjoint.
 #pragma once
 
 #include "core/covariance.h"

@@ -1,6 +1,5 @@
 // A camera of any model: a mean's pixel, the Jacobian there, the blur, and the adjoints. Most functions are compiled
-// for two types: Camera, the pinhole of 3DGS, and FullCamera, all models and effects as branches, which all threads
-// take alike.
+// for Camera, the pinhole of 3DGS, and FullCamera, all models and effects as branches, which threads take alike.
 #pragma once
 
 #include "core/defocus.h"
@@ -150,8 +149,7 @@ template <typename T> struct CameraGradSums {
 };
 inline constexpr int kCameraNumbers = 16 + 16 + 3 + kLensWidth;
 
-/// Numbers of view, proj, position and lens, one after the other: where to write it, and the column of CameraGrad that
-/// it is the sum of; -1: zero.
+/// Of view, proj, position and lens in a row: where to write a number, and its column of CameraGrad; -1: zero.
 template <typename T> struct CameraNumber {
   T* to;
   int column;

@@ -15,8 +15,8 @@ template <typename T> struct Correction {
   T rows[3][4];
 };
 
-/// v = 1 + sum of k_j (r^(2j) - its mean over the picture), j = 1, 2, whose mean is 1. r: from the principal point, in
-/// halves of the diagonal.
+/// v = 1 + sum of k_j (r^(2j) - its mean over the picture), j = 1, 2. r: from the principal point, in halves of the
+/// diagonal.
 template <typename T> struct Radii {
   int64_t width;         ///< px
   T center_x, center_y;  ///< px

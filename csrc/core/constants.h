@@ -1,5 +1,4 @@
-// Constants of 3DGS, sizes of tiles, and limits that keep float32 finite. A test compares the copies in the viewer's
-// page.
+// Constants of 3DGS, sizes of tiles, and limits that keep float32 finite. A test compares the viewer's copies.
 #pragma once
 
 namespace ar {
@@ -12,7 +11,7 @@ inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
 inline constexpr int kRayTileBits = 3;
 /// An image with fewer such tiles is small.
 inline constexpr int kSmallImageTiles = 4096;
-/// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid()).
+/// With fewer 16x16 tiles CUDA spreads four samples over lanes (spread_grid()).
 inline constexpr int kSpreadImageTiles = 4096;
 
 /// Least camera-space z of a mean [world units].
@@ -32,7 +31,7 @@ inline constexpr double kAlphaMax = 0.99;
 /// A sample stops before T falls below this.
 inline constexpr double kTransmittanceMin = 1e-4;
 
-/// In 3DGS's radius, half the eigenvalues' difference is at least the root of this [px^4].
+/// In 3DGS's radius: the least square of half the eigenvalues' difference [px^4].
 inline constexpr double kRadiusMinGap = 0.1;
 
 /// Variance of the unit pixel along each axis [px^2].
@@ -48,7 +47,7 @@ inline constexpr double kReachMargin = 1 + 2e-6;
 /// Five roundings of float32: the error of a whitened coordinate, relative to the sum of its terms.
 inline constexpr double kBoxRounding = 3e-7;
 
-// Gaussians with numbers beyond these are culled: nothing derived overflows a float.
+// Gaussians beyond these are culled: nothing derived overflows a float.
 /// det Sigma [px^4]: standard deviations up to 3e7 px.
 inline constexpr double kMaxDet = 1e30;
 /// World units.
@@ -66,7 +65,7 @@ inline constexpr double kMaxQuaternionGrad = 1e38;
 
 inline constexpr int kMaxChannels = 512;
 
-/// Weights are summed as integers of this unit: the order of pixels changes no bit.
+/// Weights are summed as integers of this unit: their order changes no bit.
 inline constexpr double kWeightUnit = 1.0 / 4294967296.0;
 
 inline constexpr double kPi = 3.14159265358979323846;

@@ -1,6 +1,5 @@
-// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian.
-// Products are formed in coordinates in which terms do not cancel (docs/internals/numerics.md, from "Gradient in the
-// turned frame" on).
+// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. In
+// coordinates in which terms do not cancel (docs/internals/numerics.md, from "Gradient in the turned frame" on).
 #pragma once
 
 #include "core/blur.h"

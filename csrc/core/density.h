@@ -1,5 +1,5 @@
-// What density control does to every Gaussian in every step: `observe` adds a picture to its statistics, `add_noise`
-// moves its mean at random.
+// Density control of a Gaussian in every step: `observe` adds a picture to its statistics, `add_noise` moves its mean
+// at random.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// The functions that formulas may call on a type V: here float (a CUDA thread) and double (tests), in cpu/pack.h pixels
-// of the CPU. ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
+// Functions that formulas call on a type V: float (a CUDA thread) and double (tests) here, packs of pixels in
+// cpu/pack.h. ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
 #pragma once
 
 #include <cfloat>
@@ -39,7 +39,7 @@ AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
-/// One instruction where there is one that keeps NaN.
+/// One instruction where one keeps NaN.
 AR_HD float min(float a, float b) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   float y;
@@ -59,8 +59,7 @@ AR_HD float max(float a, float b) {
 #endif
 }
 
-/// a * b + c, contracted where there is an instruction; the build contracts nothing else, so that both passes round
-/// alike.
+/// a * b + c, contracted where there is an instruction. The build contracts nothing else: both passes round alike.
 AR_HD float madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)
   return std::fma(a, b, c);

@@ -1,5 +1,4 @@
-// Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: what lens and
-// shutter add to a covariance in the image.
+// Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: of lens and shutter.
 #pragma once
 
 #include "core/footprint/contract.h"

@@ -1,10 +1,10 @@
 // Order along rays, Effects(order="ray") (docs/internals/numerics.md, "Order along rays"): at which depth the ray of a
 // pixel meets a splat, and the window in which a pixel sorts the splats of its list. The definition knows only scene,
-// camera and size of the window, so that pictures depend neither on tiles nor on the device:
+// camera and window: pictures depend neither on tiles nor on the device.
 //
-//   A window of n slots is empty at first. The splats of the list that show in a sample of the pixel enter it one after
-//   the other. If there are n in it already, the nearest of these n + 1 leaves and is composited; of equal depths the
-//   one that comes first in the list. At the end of the list all leave, the nearest first.
+//   The splats of the list that show in a sample of the pixel enter a window of n slots one after the other. If it is
+//   full, the nearest of these n + 1 leaves and is composited; of equal depths the first in the list. At the end of the
+//   list all leave, the nearest first.
 //
 // So no splat is lost, and in a window as long as the list the order is exact. A splat that moves nodes is evaluated
 // when it leaves.
@@ -69,8 +69,8 @@ AR_HD Vec2<T> ray_slope(const Cam& camera, const Gaussians<T>& g, int64_t i, Vec
   });
 }
 
-/// A splat in the window of a pixel, by its place in the tile's list; -1: none. Footprints whose samples stay keep what
-/// they have computed.
+/// A splat in the window of a pixel, by its place in the tile's list; -1: none. Footprints whose samples stay keep
+/// their alphas.
 template <class V, int kKept> struct WindowEntry {
   V depth;
   IndexOf<V> place;
@@ -94,13 +94,13 @@ AR_HD WindowEntry<V, kKept> select(MaskOf<V> m, const WindowEntry<V, kKept>& a, 
   return out;
 }
 
-/// Puts `next`, which is later in the list than all of the window, into it, and returns the nearest. Slots are sorted
-/// by depth, equal depths by place. `nothing` of depth -infinity changes nothing.
+/// Puts `next`, later in the list than the window, into the window, and returns the nearest. Slots are sorted by depth,
+/// equal depths by place. `nothing` of depth -infinity changes nothing.
 template <class V, int kKept>
 AR_HD WindowEntry<V, kKept> exchange_nearest(WindowEntry<V, kKept>* slots, int count,
                                              const WindowEntry<V, kKept>& next) {
   WindowEntry<V, kKept> previous = slots[0];
-  MaskOf<V> after = next.depth < previous.depth;  // whether `previous` comes after `next`
+  MaskOf<V> after = next.depth < previous.depth;
   const WindowEntry<V, kKept> nearest = select(after, next, previous);
   for (int k = 1; k < count; ++k) {
     const WindowEntry<V, kKept> slot = slots[k];

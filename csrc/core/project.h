@@ -1,5 +1,5 @@
-// Projects one Gaussian to one splat, for every backend: project_gaussian makes mean, covariance, opacity and depth,
-// shape_splat shape and support, splat_color the colour. project_vjp is the adjoint of all three.
+// Projects a Gaussian to a splat: project_gaussian makes mean, covariance, opacity and depth, shape_splat shape and
+// support, splat_color the colour. project_vjp is the adjoint of all.
 #pragma once
 
 #include <type_traits>
@@ -33,7 +33,7 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   return g.scale_modifier * max(abs(s.x), max(abs(s.y), abs(s.z)));
 }
 
-/// A cheap test, true for every Gaussian that is kept. Writes the projected mean.
+/// A cheap test, true for all that are kept. Writes the projected mean.
 template <class Cam, typename T>
 AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds,
                           ProjectedMean<T>& p) {
@@ -74,7 +74,7 @@ template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// False if such a Gaussian would be culled, or the depth is negative or NaN.
+/// False if it would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   const Vec2<T> m = rows.means2d[i];
@@ -98,7 +98,7 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
     return false;
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
   out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], depth_at(camera, mean.view)};
-  // Before the blur: a large blur must not make a degenerate Gaussian valid.
+  // Before a blur, which must not make a degenerate Gaussian valid.
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
@@ -172,8 +172,7 @@ AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGauss
   to.ids[place] = int32_t(i);
 }
 
-/// Writes the gradient of the colour's parameters, returns that of the model's ray. `dL_dsh`, the gradient of the
-/// coefficients `sh`, may be null or the same memory.
+/// Writes the gradient of the colour's parameters, returns that of the model's ray. `dL_dsh` may be null or `sh`.
 template <class Cam, typename T, class Out>
 AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* sh,
                               Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
@@ -265,7 +264,7 @@ AR_HD Vec3<T> shown_depth_vjp(const Cam& camera, Vec3<T> view, const ShownGrad<T
   return depth_vjp(camera, view, shown.depth);
 }
 
-/// All but out.shs; adds that of a full camera to `camera_grad`, if not null. grad_of(covariance, opacity) returns the
+/// All but out.shs; adds a full camera's to `camera_grad`, if not null. grad_of(covariance, opacity) returns the
 /// ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp.
 template <class Cam, typename T, class GradOf, class Shown, class Out>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, const Shown& shown,

@@ -1,5 +1,5 @@
-// The rows that the op `project` returns to Python, one for each visible Gaussian: which Gaussians are visible
-// (measure_row), what a row holds (write_row), and the gradient of a row.
+// The rows that the op `project` returns: which Gaussians have one (measure_row), what it holds (write_row), and its
+// gradient.
 #pragma once
 
 #include "core/project.h"
@@ -36,14 +36,14 @@ AR_HD Vec3<T> shown_depth_vjp(const Cam& camera, Vec3<T> view, const RowShownGra
 /// Half the width and height of the ellipse where alpha is kAlphaMin, in whole px, as gsplat has them; its conic, and
 /// the opacity there.
 template <typename T> struct RowMeasure {
-  bool drawn;  ///< The ellipse's rectangle meets the image, and the rules leave it.
+  bool drawn;  ///< Its rectangle meets the image, and the rules leave it.
   int x, y;
   Vec3<T> conic;  ///< 1/px^2
   T opacity;
 };
 
-/// A row that is not drawn would show nothing: the nearest pixel centre is half a pixel beyond the ellipse, where an
-/// integral over the pixel too is below kAlphaMin.
+/// Rows not drawn would show nothing: pixel centres are half a pixel beyond the ellipse or more, where an integral over
+/// the pixel too is below kAlphaMin.
 template <typename T>
 AR_HD RowMeasure<T> measure_row(const ProjectedGaussian<T>& p, const RowRules<T>& rules, TileGrid grid) {
   const T v = rules.variance, xx = p.cov.xx + v, yy = p.cov.yy + v;
@@ -99,8 +99,8 @@ template <typename T> AR_HD void write_no_row(const RowOutputs<T>& to, int64_t r
   write_row(to, row, gaussian, nothing, {zero, zero, zero}, zero, 0, RowMeasure<T>{});
 }
 
-/// Writes the row of Gaussian i, or only the flag of whether it has one. `radius`: as above; 0: it is not drawn, and
-/// neither `view`, the mean in camera space, nor `p` is read. Gives `p` the depth of the row.
+/// Writes the row of Gaussian i, or the flag of whether it has one. `radius`: as above; 0: it is not drawn, and neither
+/// `view`, the mean in camera space, nor `p` is read. Gives `p` the depth of the row.
 template <class Cam, typename T>
 AR_HD void write_row_or_flag(const Cam& camera, const RowRules<T>& rules, const RowOutputs<T>& to, int32_t* flags,
                              int64_t i, Vec3<T> view, ProjectedGaussian<T>& p, Vec3<T> color, int radius) {

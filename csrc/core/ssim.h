@@ -13,7 +13,7 @@ inline constexpr int kSsimRadius = 5, kSsimWindow = 2 * kSsimRadius + 1;
 /// Against 0 / 0.
 inline constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
-/// Along one axis; at(k) is the value k pixels from the centre. By symmetry also the adjoint.
+/// Along one axis; at(k) is k pixels from the centre. Its own adjoint.
 template <typename T, class At> AR_HD T window_sum(const At& at) {
   // exp(-k^2 / (2 * 1.5^2)), normalised
   constexpr double kWeights[] = {0.26601172486179434341, 0.21300553771125369989, 0.10936068950970001069,
@@ -90,7 +90,7 @@ template <typename T, typename Target> struct SsimVjpParams {
   AR_HD int64_t pixels() const { return planes * height * width; }
 };
 
-/// Gradients by |x - y| and by the similarity, equal in all pixels. Partials include dL_dmap.
+/// Gradients by |x - y| and the similarity, equal in all pixels. Partials include dL_dmap.
 template <typename T, typename Target> AR_HD LossWeights<T> pixel_weights(const SsimVjpParams<T, Target>& p) {
   if (p.dL_dmap) return {T(0), T(1), T(0)};
   const T share = *p.dL_dloss / T(p.pixels());

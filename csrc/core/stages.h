@@ -1,5 +1,5 @@
-// Structs that the stages of a frame read and write, on both devices. Pointers own nothing. "[n]" is the shape of an
-// array. A gradient of a symmetric matrix has its off-diagonal entries doubled (Sym2 in vec.h).
+// Structs that the stages of a frame read and write, on both devices. "[n]" is a shape. A gradient of a symmetric
+// matrix has its off-diagonal entries doubled (Sym2 in vec.h).
 //
 //     project -> bin -> blend          forward
 //     blend_vjp -> project_vjp         backward
@@ -78,7 +78,7 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// The camera model's, camera-space z, or the distance from the camera.
+/// kOfModel: the camera model's.
 enum class DepthKind : int32_t { kNone, kOfModel, kZ, kDistance };
 
 /// Two more sums per splat, for density control: of each pixel's dL/dmean.
@@ -128,7 +128,7 @@ template <class F, typename T> struct alignas(16) Splat {
   Vec3<T> color;
 };
 
-/// Its footprint is known at run time.
+/// Of any footprint.
 template <typename T> struct alignas(16) SplatRow {
   Vec2<T> mean;
   T shape[kShapeWidth];
@@ -195,7 +195,7 @@ template <typename T> struct ProjectParams {
   Channels<T> given;  ///< the caller's, or null: a row that is not finite culls its Gaussian
 };
 
-/// The splats of the public stages, which no footprint has shaped.
+/// Public rows, which no footprint has shaped.
 template <typename T> struct ProjectedRows {
   Vec2<T>* means2d = nullptr;  ///< px
   Sym2<T>* cov2d = nullptr;    ///< px^2
@@ -203,7 +203,7 @@ template <typename T> struct ProjectedRows {
   T* opacities = nullptr;      ///< with the amplitude of a camera's blur
   T* depths = nullptr;         ///< world units
   Vec3<T>* colors = nullptr;   ///< or null
-  T center = T(0);             ///< where pixels have their centres in means2d [px]
+  T center = T(0);             ///< of pixels, in means2d [px]
 };
 
 /// A camera's Gaussians among the rows of all cameras.
@@ -211,7 +211,7 @@ struct RowPlaces {
   const int32_t* rows = nullptr;   ///< [n] row of a Gaussian, or -1
   const int32_t* ends = nullptr;   ///< [n] or else: rows up to and including this Gaussian's
   const int32_t* radii = nullptr;  ///< [rows, 2] or else: every Gaussian has a row, which counts if this is positive
-  int64_t first = 0, last = 0;     ///< with `ends`: rows of the camera, the last not among them
+  int64_t first = 0, last = 0;     ///< with `ends`: rows of the camera, without `last`
 
   /// -1: none.
   AR_HD int64_t of(int64_t i) const {

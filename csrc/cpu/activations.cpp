@@ -1,4 +1,4 @@
-// What training.h does to each Gaussian by itself. Sums over chunks are added in order.
+// Functions of training.h for Gaussians. Sums over chunks are added in order.
 #include "core/activations.h"
 
 #include <algorithm>

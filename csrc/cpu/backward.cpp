@@ -1,4 +1,4 @@
-// The backward pass of the CPU, called as forward.cpp is: its stages, and the loops that each runs.
+// The backward pass of the CPU, called as forward.cpp is.
 //
 //   blend_vjp      gradients of images to a row for each pair                 blend_vjp.h, blend_rays_vjp.h
 //   sum_channels   rows of pairs to gradients of channels                     sum_channels.h

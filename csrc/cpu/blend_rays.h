@@ -41,8 +41,7 @@ template <class P, typename T> struct RaySamples {
   }
 };
 
-/// Composites an entry, the splat of a lane, into all samples. visit(sample, opacity * weight, Blended) comes before a
-/// sample moves.
+/// Composites an entry into all samples. visit(sample, opacity * weight, Blended) comes before a sample moves.
 template <class P, typename T, class Entry, class Visit>
 AR_HD void blend_entry(const RayList<P, T>& list, const Entry& entry, const int32_t* places, uint32_t lanes,
                        Vec2<typename LanesOf<T>::Type> at, RaySamples<P, T>& samples, const Visit& visit) {

@@ -1,6 +1,6 @@
 // Loop of blend_vjp in the order along rays, which is taken as given (core/order.h). A pack composites its splats
-// again, and logs them. Then it walks the log back, and adds to the rows of pairs lane by lane: in the same order in
-// every run, since a tile has one thread.
+// again, logs them, walks the log back, and adds to rows of pairs lane by lane: in a fixed order, since a tile has one
+// thread.
 #pragma once
 
 #include "cpu/blend_rays.h"

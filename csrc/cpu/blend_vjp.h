@@ -1,5 +1,4 @@
-// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first, for a window of channels. Writes gradients
-// per pair.
+// Loop of blend_vjp: as blend.h, last splat first, for a window of channels. Writes gradients per pair.
 #pragma once
 
 #include "core/blend.h"

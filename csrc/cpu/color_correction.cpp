@@ -1,5 +1,4 @@
-// correct_colors and correct_colors_vjp of training.h. Sums of chunks are added in order, so that threads change no
-// bit.
+// correct_colors and correct_colors_vjp of training.h. Sums of chunks are added in order.
 #include "core/color_correction.h"
 
 #include <algorithm>

@@ -1,12 +1,12 @@
-// The forward pass of the CPU: its stages, in the order of Backend (torch/backend.h), and the loops that each runs.
-// torch/backend_cpu.cpp allocates, fills the parameters of stages.h, and calls these functions.
+// The forward pass of the CPU, in the order of Backend (torch/backend.h), with the loops of each stage.
+// torch/backend_cpu.cpp allocates, and calls these functions.
 //
 //   project   Gaussians to splats, or to public rows             project.h, rows.h
 //   bin       splats to the list of each tile, sorted by depth   bin.h, sort.cpp
 //   blend     lists to images                                    blend.h, blend_rays.h
 //   inspect   lists to statistics of pixels and Gaussians        inspect.h
 //
-// stages_of() is the table of the instruction set that instruction_sets.cpp chose. backward.cpp has the adjoints.
+// stages_of() is the table of the instruction set that instruction_sets.cpp chose.
 #include <utility>
 
 #include "cpu/stages.h"
@@ -46,7 +46,7 @@ template <typename T> void blend(int footprint, const BlendParams<T>& p) {
 
 template <typename T> void inspect(int footprint, const InspectParams<T>& p) { stages_of<T>(footprint).inspect(p); }
 
-// The weight of splats in pixels, by itself.
+// weight
 
 template <typename T> void weight(int footprint, const WeightParams<T>& p) { stages_of<T>(footprint).weight(p); }
 

@@ -1,4 +1,4 @@
-// Chooses the instruction set, once per process, and fills tables of stages (stages.h) with functions of kernels_*.cpp.
+// Chooses the instruction set, once per process, and fills tables of stages (stages.h).
 #include <cstdlib>
 #include <cstring>
 #include <vector>

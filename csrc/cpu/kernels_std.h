@@ -1,5 +1,5 @@
-// The standard headers of the loops, included before the target is switched, so that standard templates are compiled
-// for the baseline.
+// The standard headers of the loops, included before the target is switched: their templates are compiled for the
+// baseline.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
-// Runs the loops of parallel_for(): a region of OpenMP whose threads, as many as team.h says, take items from a shared
-// counter. Without OpenMP the calling thread runs all items.
+// parallel_for(): threads of OpenMP, as many as team.h says, take items from a shared counter. Without OpenMP the
+// calling thread runs all.
 #include "cpu/parallel.h"
 
 #if defined(_OPENMP)

@@ -1,4 +1,4 @@
-// Loops whose items threads share. Every item writes to its own memory: results do not depend on the number of threads.
+// Loops whose items threads share. Each writes to its own memory: the number of threads changes no result.
 #pragma once
 
 #include <cstdint>

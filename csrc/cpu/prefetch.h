@@ -1,4 +1,4 @@
-// Prefetches rows that are read at random in memory.
+// Prefetches rows that are read at random.
 #pragma once
 
 #include "core/stages.h"

@@ -1,4 +1,4 @@
-// cpu_quota() of quota.h. Reads the files of control groups, version 1 or 2.
+// Reads the files of control groups, version 1 or 2.
 #include "cpu/quota.h"
 
 #include <algorithm>

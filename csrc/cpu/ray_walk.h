@@ -1,6 +1,5 @@
-// A pack of pixels walks the list of its tile in the order along rays (core/order.h): lists and windows, for
-// blend_rays.h and blend_rays_vjp.h. Lanes are at different splats when these leave their windows, so what blending
-// reads of a splat is gathered.
+// A pack of pixels walks the list of its tile in the order along rays (core/order.h), for blend_rays.h and
+// blend_rays_vjp.h. Different splats leave the lanes' windows, so their numbers are gathered.
 #pragma once
 
 #include <cstring>
@@ -15,7 +14,7 @@
 
 namespace ar::AR_ISA {
 
-/// The splats of a tile's list. They are prepared when a pack first asks for them.
+/// The splats of a tile's list, prepared when first asked for.
 template <class P, typename T> class RayList {
   struct Nothing {};
 
@@ -73,7 +72,7 @@ template <class Visit> AR_HD void for_each_lane(uint32_t lanes, const Visit& vis
   for (; lanes != 0; lanes &= lanes - 1) visit(__builtin_ctz(lanes));
 }
 
-/// Numbers of different splats, a lane each: visit(lane) returns a pointer to `kNumbers` of them. Other lanes are zero.
+/// of(lane) points to kNumbers numbers of the lane's splat. Other lanes are zero.
 template <int kNumbers, typename T, class Of>
 AR_HD void gather(uint32_t lanes, typename LanesOf<T>::Type (&to)[kNumbers], const Of& of) {
   constexpr int kCount = LanesOf<T>::kCount;
@@ -99,12 +98,12 @@ template <class P, typename T> class RayWalk {
         at{load(kTilePixelsOf<T>.x + pixel, V()), load(kTilePixelsOf<T>.y + pixel, V())},
         pixel_{V(T(list.view.x0)) + at.x, V(T(list.view.y0)) + at.y} {}
 
-  /// leave(entry, its lanes) for all splats, in order; it returns whether any sample of the pack is still open.
+  /// leave(entry, its lanes) for all splats, in order; it returns whether the pack has an open sample.
   template <class Leave> void run(const Leave& leave) {
     const V none(-std::numeric_limits<T>::infinity());
     Entry slots[kMaxRayWindow];
     for (int k = 0; k < window_; ++k) slots[k] = Entry::nothing(none);
-    int left = 0;  // Slots that are empty again, behind the end of the list.
+    int left = 0;  // Empty again, behind the end of the list.
     for (int32_t place = 0; left < window_; ++place) {
       Entry nearest;
       if (!list_.has(place)) {

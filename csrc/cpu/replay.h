@@ -1,5 +1,5 @@
-// Samples that move. TilePlaces is their state in a tile. Replay composites a tile again for blend_vjp.h and logs
-// alphas and positions: earlier ones do not follow from later ones.
+// Samples that move: TilePlaces is their state. Replay composites a tile again for blend_vjp.h and logs alphas and
+// positions, which do not follow from later ones.
 #pragma once
 
 #include <algorithm>
@@ -53,7 +53,7 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
     V log_alpha[kGroup];  ///< To base 2.
   };
 
-  /// For whitened pixels z. False if no alpha reaches its minimum: then no exponential is needed.
+  /// For whitened pixels z. False if no alpha reaches its minimum.
   template <class Terms> AR_HD bool look(const Terms& terms, Vec2<V> z, int first, int pixel, Group& group) const {
     V most = V(T(kLogAlphaMin - 1));
     AR_UNROLL for (int j = 0; j < kGroup; ++j) {
@@ -78,7 +78,7 @@ template <class P, typename T> struct ReplayTile {
 /// Alphas, and positions before each pair, from the last pair of a tile to the first. Empty unless P moves.
 ///
 /// The walk back needs no exponentials. A full log begins anew: earlier pairs are composited again from the nearest of
-/// kStates states, so that memory does not depend on the list.
+/// kStates states. So memory does not depend on the list.
 template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   using V = typename LanesOf<T>::Type;
   using Places = TilePlaces<P, T>;
@@ -121,7 +121,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
 
   AR_HD int pixel() const { return end_[-entries_].pixel; }
 
-  /// A group into which the pair was composited. Groups of a pack follow each other.
+  /// A group that the pair was composited into, pack by pack.
   AR_HD Found take() {
     const Entry& entry = end_[-entries_--];
     for (const uint32_t lanes : entry.lanes) top_ -= 3 * lanes_stored(lanes, V());

@@ -1,5 +1,4 @@
-// Loops over public rows: shape_rows() makes splats of them, row_grads() adds up the pairs of a splat to the gradient
-// of its row.
+// Loops over public rows: shape_rows() makes splats, row_grads() adds up pairs to the gradient of a row.
 #pragma once
 
 #include "cpu/project.h"

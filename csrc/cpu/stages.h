@@ -25,7 +25,7 @@ inline constexpr int kWindow = 32;
 /// Per thread.
 inline constexpr int64_t kReplayNumbers = int64_t(1) << 20;
 
-/// count_candidates marks Gaussians that may be visible; project writes only theirs.
+/// count_candidates marks what may be visible; project writes only that.
 template <typename T> struct ProjectParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
@@ -42,14 +42,14 @@ template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   RowRules<T> rules;
   RowOutputs<T> rows;    ///< Not of rows that are not drawn.
   PackedRows<T> packed;  ///< Instead of rows.
-  int32_t* flags;        ///< [gaussians] instead of both: 1 for a Gaussian that has a row, else 0.
+  int32_t* flags;        ///< [gaussians] instead of both: 1 if it has a row, else 0.
 };
 
 template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {
   int threads;
 };
 
-/// 16 bytes, because they are read at random.
+/// 16 bytes: read at random.
 struct SplatTiles {
   TileMask mask;        ///< 8x8 tiles from (row, column) on. 0: too many for it.
   int32_t row, column;  ///< Row -1: no tile.

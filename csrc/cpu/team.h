@@ -1,5 +1,5 @@
-// How many threads a loop gets: a rule without a clock or threads of its own. A loop of OpenMP ends when all threads of
-// its team have come; beside other programs the last may come after all work is done.
+// How many threads a loop gets, without a clock or threads of its own. A loop of OpenMP waits for all of its team;
+// beside other programs the last may come after all work is done.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +8,7 @@
 namespace ar::cpu {
 
 /// Halves the team when loops lose more by waiting for late threads than they gain. Now and then tries twice as many.
-/// Times are in seconds.
+/// Times: s.
 class TeamSize {
  public:
   /// For the next loop, from 1 to `threads`.
@@ -20,8 +20,8 @@ class TeamSize {
     return std::min(size_, threads);
   }
 
-  /// After a loop that had a team of this size. `together`: from the time at which the last thread began until the
-  /// first one found no item. Negative if the last one came too late, and the loop waited for nothing.
+  /// After a loop with a team of this size. `together`: from when the last thread began until the first found no item.
+  /// Negative if the last came too late, and the loop waited for nothing.
   void learn(int team, double together, double took) {
     rest_ -= took;
     if (team == 1) return;

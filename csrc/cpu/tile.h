@@ -1,5 +1,4 @@
-// Tiles on the CPU. Packs lay out a tile's pixels, reach_of() finds those that a splat reaches, tile_splat() prepares a
-// splat.
+// Tiles on the CPU: Packs lays out pixels, reach_of() finds those that a splat reaches, tile_splat() prepares a splat.
 #pragma once
 
 #include <algorithm>
@@ -26,7 +25,7 @@ template <typename T> struct Packs {
   }
 };
 
-/// Of pixels (x, y), and of the first pixel of packs (left, top), for a column of packs or a load of lanes.
+/// Of pixels (x, y), and first pixels of packs (left, top), for a column of packs or a load of lanes.
 template <typename T> struct TilePixels {
   static constexpr int kFirst = Packs<T>::kRows < Packs<T>::kLanes ? Packs<T>::kLanes : Packs<T>::kRows;
   alignas(64) T x[kTilePixels] = {}, y[kTilePixels] = {};
@@ -153,7 +152,7 @@ template <class P, typename T> AR_HD const Splat<P, T>& splat_at(const T* splats
 /// Pairs from prefetch to use.
 inline constexpr int kPrefetch = 16;
 
-/// Prepared together, so that branches of the loops over pixels are known early.
+/// Prepared together, so that branches over pixels are known early.
 inline constexpr int kBatch = 16;
 
 template <class P, typename T> AR_HD auto terms_in_tile(const Splat<P, T>& splat, const TileView& view) {

@@ -1,6 +1,5 @@
-// The backward pass of CUDA, stage by stage in the order of Backend (torch/backend.h): the adjoints of forward.cu,
-// called in the same way. `blend_vjp` is one of still/, moment/, channels/ and rays/, the kernels of the others are in
-// project/project_vjp.cuh.
+// The backward pass of CUDA: the adjoints of forward.cu, called in the same way. `blend_vjp` is in still/, moment/,
+// channels/ and rays/, the rest in project/project_vjp.cuh.
 #include <algorithm>
 #include <mutex>
 #include <set>
@@ -11,8 +10,8 @@
 namespace ar::cuda {
 namespace {
 
-/// Kernels on a multiprocessor share one division of its memory into cache and shared memory: blend_vjp, with much of
-/// the latter, cannot begin beside a kernel with much cache. Once per device: every call takes memory.
+/// Kernels on a multiprocessor share one division of its memory: blend_vjp, with much shared memory, cannot begin
+/// beside a kernel with much cache. Once per device: every call takes memory.
 void let_blend_vjp_begin_beside_zero_culled_grads() {
   static std::mutex mutex;
   static std::set<int> devices;
@@ -26,9 +25,8 @@ void let_blend_vjp_begin_beside_zero_culled_grads() {
 
 constexpr int kClearBlock = 256;
 
-/// Comes before each group of channels of blend_vjp. Sets *chunks_taken to zero. Where tiles share the lists of
-/// patches, also the rows that tiles add to: pair_grads for the first group, and channel_sums [n, width] for every
-/// group.
+/// Before each group of channels. Zeros *chunks_taken and, with patches, the rows that tiles add to: pair_grads for the
+/// first group, channel_sums [n, width] for all.
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;

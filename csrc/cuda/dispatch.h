@@ -63,7 +63,7 @@ inline Family family_at(int footprint, int64_t channels, bool rays = false) {
   visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels, rays); });
   return found;
 }
-/// Calls f(F{}) for a footprint F whose splats may be ordered along rays.
+/// Calls f(F{}) if splats may be ordered along rays.
 template <class Function> void visit_along_rays(int footprint, Function&& f) {
   visit_pixels(footprint, [&](auto chosen) {
     if constexpr (decltype(chosen)::kAlongRays) f(chosen);
@@ -77,7 +77,7 @@ template <Family kFamily, class Function> void visit_lanes(int footprint, TileGr
   });
 }
 
-/// Calls f(F{}, side) for a footprint F whose samples move.
+/// Calls f(F{}, side) if samples move.
 template <class Function> void visit_tiles(int footprint, TileGrid grid, Function&& f) {
   visit_pixels(footprint, [&](auto chosen) {
     using F = decltype(chosen);
@@ -139,7 +139,6 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
   return route;
 }
 
-/// `left`: all channels that are left.
 template <class F> constexpr int group_width(int left) {
   return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }

@@ -1,5 +1,5 @@
-// The forward pass of CUDA, stage by stage in the order of Backend (torch/backend.h). backend_cuda.cpp allocates, fills
-// the structs of params.h, and calls these functions, which launch the kernels:
+// The forward pass of CUDA, in the order of Backend (torch/backend.h). backend_cuda.cpp allocates, and calls these
+// functions, which launch the kernels:
 //
 //   project   Gaussians to splats, or to public rows     project/project.cuh
 //   bin       splats to a list for each tile, by depth   bin/bin.cuh, bin/sort.cuh

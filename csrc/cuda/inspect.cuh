@@ -1,4 +1,4 @@
-// Kernel inspect. It walks lists as blending does, and writes statistics of pixels and Gaussians (core/inspect.h).
+// Kernel inspect: walks lists as blending does, and writes statistics of pixels and Gaussians (core/inspect.h).
 #pragma once
 
 #include <algorithm>
@@ -33,7 +33,7 @@ __device__ inline void add_shown(const InspectParams& params, int32_t id, const 
   atomicMax(&params.largest[id], largest);
 }
 
-/// A block per tile, a warp per subtile: of 8x8 pixels those of a column, of 4x4 a part of one.
+/// A block per tile, a warp per subtile.
 template <class F, int kSide, Look kLook>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();

@@ -1,9 +1,9 @@
-// How the host launches every kernel, how every kernel begins, and what the host asks a device.
+// How kernels are launched and begin, and what the host asks a device.
 //
-// A kernel may be on the device before earlier kernels of its stream have ended (programmatic dependent launch). So
-// every thread first calls wait_for_earlier_kernels(). Except in a kernel B that runs beside the kernel A before it: A
-// calls let_next_kernel_begin(), B begin_beside_earlier_kernels(). B reads what was written before a kernel that waits
-// first and then lets the next begin.
+// A kernel may begin before earlier kernels of its stream have ended (programmatic dependent launch): every thread
+// first calls wait_for_earlier_kernels(). Except in a kernel B that runs beside the kernel A before it: A calls
+// let_next_kernel_begin(), B begin_beside_earlier_kernels(). B reads what was written before a kernel that waits first
+// and then lets the next begin.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -31,16 +31,15 @@ __device__ inline void let_next_kernel_begin() {
 #endif
 }
 
-/// For kernel B. True for the last block, which does no work: it ends after kernel A, because the next kernel waits for
-/// B alone.
+/// For kernel B. True for the last block, which only ends after kernel A, because the next kernel waits for B alone.
 __device__ inline bool begin_beside_earlier_kernels(bool beside) {
   const bool is_last = blockIdx.x == gridDim.x - 1;
   if (!beside || is_last) wait_for_earlier_kernels();
   return is_last;
 }
 
-/// Whether kernels may begin early on the current device. Drivers must allow it in graphs too. Code compiled at load
-/// time from older PTX does not wait; `kernel` stands for all.
+/// Whether kernels may begin early on the current device, in graphs too. Code from older PTX does not wait; `kernel`
+/// stands for all.
 inline bool may_begin_early(const void* kernel) {
   constexpr int kGraphsMayHoldIt = 12030;  // CUDA of the driver
   enum : signed char { kNotAsked, kNo, kYes };

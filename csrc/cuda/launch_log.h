@@ -1,4 +1,4 @@
-// For tests: what launch() calls with every kernel, while csrc/torch/kernels_cuda.cpp records them.
+// For tests: what launch() calls while torch/kernels_cuda.cpp records kernels.
 #pragma once
 
 #include <atomic>

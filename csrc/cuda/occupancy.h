@@ -20,8 +20,7 @@ inline constexpr int kArchitecture = __CUDA_ARCH__;
 #else
 inline constexpr int kArchitecture = 900;  // the host needs none
 #endif
-/// The second launch bound: `wanted` resident blocks, or what fits. More blocks hide more latency, with fewer
-/// registers.
+/// The second launch bound: `wanted` resident blocks, or what fits.
 constexpr int blocks_per_sm(int wanted, int threads, int architecture = kArchitecture) {
   const int fit = resident_threads(architecture) / threads;
   return fit < 1 ? 1 : fit < wanted ? fit : wanted;

@@ -1,5 +1,5 @@
-// Parameter structs of the CUDA stages, and functions that launch them. A struct adds to its namesake in core/stages.h
-// what CUDA needs. Pointers are device memory of the caller. No function waits for the device.
+// Parameter structs of the CUDA stages, and functions that launch them. Structs add to their namesakes in
+// core/stages.h. Pointers are device memory of the caller. Nothing waits for the device.
 //
 // Only the device knows the number of pairs. The caller gives room for `capacity` pairs, at least one per splat. If
 // there are more, neighbouring tiles (a patch) share a list, and blending tests its splats against each tile: slower,
@@ -26,7 +26,7 @@ inline constexpr int kFewChannels = 4;
 /// Channels of a group, and of a last group.
 inline constexpr int kChannelGroup = 32, kSmallGroup = 8;
 
-/// Of the sort by depth: bits of a digit, and digits.
+/// Of the sort by depth: bits of a digit, digits.
 inline constexpr int kDepthBits = 9, kDepthPasses = 4;
 inline constexpr int kDepthHistogramWords = kDepthPasses << kDepthBits;
 
@@ -43,13 +43,13 @@ struct PairRange {
 
 /// A whole warp writes the pairs of more tiles.
 inline constexpr int kManyTiles = 16;
-/// One struct, because bin reads it in random order.
+/// One struct: bin reads it in random order.
 struct alignas(16) SplatTiles {
   TileMask mask;  ///< of 8x8 tiles from `first` on; 0: there are tiles beyond
   int32_t first, count;
 };
 
-/// In the list of a patch the slot is the splat, to whose row all tiles add.
+/// In a patch the slot is the splat, to whose row all tiles add.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
@@ -57,7 +57,7 @@ struct alignas(8) SlotPair {
 /// Of a SegmentMap (moment/maps.cuh).
 inline constexpr int kMapNumbers = 10;
 
-/// moment/: pairs between checkpoints; planes of a checkpoint: transmittance and position of every sample.
+/// moment/: pairs between checkpoints; planes of one: transmittance and position of every sample.
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
@@ -96,7 +96,7 @@ struct ProjectRowsParams {
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float>, BinInput {};
 
-/// For the order along rays, after `project`.
+/// For the order along rays.
 struct RayDepthsParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
@@ -153,7 +153,7 @@ struct InspectParams : ar::InspectParams<float> {
   const Vec3<float>* means;
 };
 
-/// rays/: what the lanes of a warp have composited, in rows that are logged again once there are more.
+/// rays/: the last `rows` events of each lane (rays/vjp.cuh).
 struct RayLog {
   uint32_t* words;   ///< [blocks, rows, words of a row, 32]
   int blocks, rows;  ///< rows: a power of two
@@ -188,7 +188,7 @@ struct PairSumsView {
   AR_HD bool by_splat() const { return counts->in_patches(capacity); }
 };
 
-/// Of channels [first, first + count) of every splat.
+/// Of channels [first, first + count).
 struct SumChannelsParams {
   PairSumsView sums;
   const float* channel_sums;  ///< as in BlendVjpParams; null: columns of pair_grads
@@ -225,11 +225,10 @@ struct RowGradsParams : ar::RowGradsParams<float> {
 
 AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 
-// The forward pass (forward.cu). `footprint`: index in the registry.
+// The forward pass (forward.cu).
 
 void project(const ProjectParams& p, cudaStream_t stream);
 void ray_depths(const RayDepthsParams& p, cudaStream_t stream);
-/// Writes rows.slopes too, if there are any.
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
 
@@ -263,7 +262,7 @@ void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);
 
-/// Where the device reports the number of pairs (torch/pair_guess.h).
+/// The device reports the number of pairs (torch/pair_guess.h).
 struct PairFeedback {
   uint64_t* word;  ///< of the host
   uint32_t frame;
@@ -296,9 +295,9 @@ void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
 /// `begun`: as in LaunchShape.
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
 int64_t max_group_sums(int footprint, const Channels<float>& channels, const ListCut& cut, TileGrid grid);
-/// Blocks and rows, and the words of all.
+/// `words`: of all blocks.
 RayLog ray_log(int footprint, TileGrid grid, int64_t& words);
-/// The group of channels from `first` on.
+/// Of channels from `first` on.
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 /// Leaves groups of 32 Gaussians without pairs to zero_culled_grads.
@@ -307,7 +306,7 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
 void sum_camera_grads(const CameraGradSums<float>& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);
 
-// The families of blending, forward (blend.cu) and backward (blend_vjp.cu).
+// The families of blending (blend.cu, blend_vjp.cu).
 
 void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
 void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
@@ -318,7 +317,7 @@ void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStr
 void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void blend_vjp_rays(int footprint, const BlendVjpParams& p, cudaStream_t stream);
 
-// Weights of a footprint (weight.cu).
+// weight.cu.
 
 template <typename T> void weight(int footprint, const WeightParams<T>& p, cudaStream_t stream);
 template <typename T> void weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream);

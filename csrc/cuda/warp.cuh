@@ -1,4 +1,4 @@
-// Sums, votes and searches over a warp, which all lanes must call; sums over a block; loads, stores and copies.
+// Sums, votes and searches, which all lanes of a warp must call; sums over a block; loads, stores and copies.
 #pragma once
 
 #include <cstdint>
@@ -98,7 +98,7 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
-/// Lanes whose `bits` agree with this lane's in `mask`, one bit.
+/// Lanes with the same bit `mask` of `bits`.
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
@@ -125,7 +125,7 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// The first k of [0, n) from which on before(k) is false, for each group of kLanes lanes.
+/// The first k in [0, n) from which on before(k) is false, per kLanes lanes.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -149,7 +149,7 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes and returns the first number of a set. Number j is bit 31 - j, which is found faster.
+/// Removes the first number of a set. Number j is bit 31 - j, which is found faster.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);

@@ -1,5 +1,4 @@
-// The weights of one footprint for many covariances and offsets, and the adjoint, for torch/backend_cuda.cpp: a thread
-// per element.
+// The weights of a footprint for many covariances and offsets, and the adjoint: a thread per element.
 #include "core/weight.h"
 
 #include "core/footprint/registry.h"

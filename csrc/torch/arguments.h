@@ -125,7 +125,7 @@ struct PrepareCamerasArguments {
 struct PrepareLensArguments {
   Tensor viewmatrix, projmatrix;
   OptionalTensor tanfovx, tanfovy, aperture, focus, shift, turn, screen, distortion;
-  std::vector<double> numbers;  ///< (kLensWidth,), but for `reach` and `fold`, which are angles, 0: not known.
+  std::vector<double> numbers;  ///< (kLensWidth,), but for `reach` and `fold`, angles or 0.
   int64_t height = 0;           ///< Of the picture, px.
   bool centered = false;        ///< `center` is the middle of the picture by the matrices.
 
@@ -159,8 +159,7 @@ struct BatchArguments : SceneArguments<std::vector<double>>, FootprintArguments 
   }
 };
 
-/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each; harmonics and values also (P, ...) or (C, P,
-/// ...).
+/// Gaussians may be in B batches, (B, P, ...), of C / B cameras each; harmonics and values (P, ...) or (C, P, ...) too.
 struct ProjectArguments : BatchArguments {
   OptionalTensor values;                        ///< (P, K), features after the colours.
   std::vector<int64_t> table;                   ///< Sizes (..., C, P) of a table with all rows, or none.
@@ -284,7 +283,7 @@ struct CompositeArguments : ImageArguments {
   }
 };
 
-/// Rows of which those of pictures with a seam are repeated.
+/// Rows, repeated in pictures with a seam.
 struct SeamArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, depths, colors;  ///< Colours (N, 3), or (0, 3).
   Tensor turns;                                      ///< (C,) px of a turn of each camera, infinite without a seam.
@@ -339,7 +338,7 @@ struct WeightArguments : FootprintArguments {
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 template <char kLetter> struct WrittenTensor : Tensor {};
 
-/// Then autograd refuses a backward pass that needs the old values. Inference tensors have no version.
+/// Then autograd refuses a backward pass that needs old values. Inference tensors have no version.
 inline void note_written(const Tensor& t) {
   if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
@@ -392,7 +391,7 @@ struct BlendRowsArguments : ImageArguments {
 };
 
 struct BlendRowsVjpArguments : ImageArguments {
-  /// (n, kPackedGradWidth), or (n, kPackedGradWidthAbsolute). May lie in the memory of the splats in `saved`.
+  /// (n, kPackedGradWidth or kPackedGradWidthAbsolute). May lie in the memory of splats in `saved`.
   WrittenTensor<'a'> dL_drows;
   OptionalTensor dL_dimage, dL_dalpha;  ///< (3, H, W), (H, W).
   Tensor background;

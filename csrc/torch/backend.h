@@ -1,5 +1,4 @@
-// Backend: a function per stage, and the tensors between stages. The ops allocate what all devices share, backends the
-// rest.
+// Backend: a function per stage, and tensors between stages. Ops allocate what all devices share, backends the rest.
 #pragma once
 
 #include <ATen/Context.h>
@@ -85,7 +84,7 @@ struct KeptRows {
   }
 };
 
-/// In the order of the ops' results. Undefined: not wanted.
+/// As in the ops' results. Undefined: not wanted.
 struct SummaryTensors {
   Tensor median;                        ///< (1, H, W) depth.
   Tensor dominant;                      ///< (1, H, W) int32.
@@ -116,7 +115,7 @@ template <class Members> Members from_list(const std::vector<Tensor>& list, size
 struct PairSums {
   Tensor pairs;         ///< CPU: (N, kPairNumbers), plus 3 for colours. CUDA: (room, kPairGradWidth).
   Tensor means;         ///< (N, 2) MeanSums, if wanted.
-  Tensor dL_dchannels;  ///< Like ChannelTensors::rows. Undefined if `pairs` has all channels.
+  Tensor dL_dchannels;  ///< Like ChannelTensors::rows; undefined if `pairs` has all.
 };
 
 /// ProjectedRows of core/stages.h, or their gradient.
@@ -177,11 +176,11 @@ struct FootprintSpec {
   int samples;  ///< Per pixel.
   bool moves;   ///< Samples have a position as state.
   int lanes;    ///< Of CUDA, for a pixel's samples.
-  int window;   ///< Slots, in the order along rays (core/order.h); 0: in the order of centres.
+  int window;   ///< Slots (core/order.h); 0: in the order of centres.
 
   bool along_rays() const { return window > 0; }
 };
-/// Between a footprint's key and the size of the window: "moment4:ray24".
+/// Between a footprint's key and the window's size: "moment4:ray24".
 inline constexpr std::string_view kRayMark = ":ray";
 FootprintSpec find_footprint(const std::string& key, double option);
 
@@ -202,7 +201,7 @@ struct Pass {
         exact(at::globalContext().deterministicAlgorithms()) {}
 };
 
-/// For `blend` and blend_vjp. Raises if there are more channels than this order can blend.
+/// For `blend` and blend_vjp. Raises if there are too many channels for the order.
 template <typename T> RayOrder<T> ray_order_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
   TORCH_CHECK_VALUE(!pass.footprint.along_rays() || channels <= kMaxRayChannels, "order 'ray' can blend at most ",
                     kMaxRayChannels, " channels, got ", channels);
@@ -231,16 +230,15 @@ class Backend {
   virtual void project_rows(const Inputs& in, const Pass& pass, const RowRules<double>& rules,
                             const ProjectedTensors& rows) = 0;
   virtual void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) = 0;
-  /// Writes rows.kept if it is given.
   virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
   virtual ListTensors bin(const SplatTensors& splats, const Pass& pass) = 0;
   /// Waits for the device.
   virtual bool tiles_share_lists(const ListTensors&) { return false; }
-  /// Writes `image` and what make_state() made, and makes the other members of `state`.
+  /// Writes `image` and what make_state() made, and makes the rest of `state`.
   virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                      const ImageTensors& image, BlendState& state) = 0;
-  /// The members but median and dominant are zero before. `depths`: the result of `project` (on CUDA undefined: those
-  /// of the Gaussians `in`); or of rows, without `in`.
+  /// All but median and dominant are zero before. `depths`: the result of `project` (on CUDA undefined: those of the
+  /// Gaussians `in`); or of rows, without `in`.
   virtual void inspect(const ListTensors& lists, const Pass& pass, const Tensor& depths, const Inputs* in,
                        const SummaryTensors& summary) = 0;
 
@@ -261,7 +259,7 @@ class Backend {
   /// With dL_dweight the adjoint.
   virtual void weight(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
 
-  /// Seconds of the device since the last call. Waits for the device.
+  /// Seconds of the device since the last call. Waits for it.
   virtual double lap() = 0;
 };
 

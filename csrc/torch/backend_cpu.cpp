@@ -1,5 +1,4 @@
-// Backend for CPU tensors of float32 or float64: allocates, and calls the stages of csrc/cpu. Tensors are checked; the
-// contents of lists are trusted.
+// Backend for CPU tensors of float32 or float64: calls the stages of csrc/cpu. Contents of lists are trusted.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/empty_like.h>
@@ -21,7 +20,7 @@
 namespace ar::ops {
 namespace {
 
-/// at::empty in huge pages: splats and pairs are new in every pass, visited in random order.
+/// at::empty in huge pages, for what is visited in random order.
 Tensor make_buffer(at::IntArrayRef sizes, const at::TensorOptions& options) {
   const Tensor buffer = at::empty(sizes, options);
 #if defined(__linux__)
@@ -311,7 +310,7 @@ template <typename T> class CpuBackend final : public Backend {
     return camera_grads;
   }
 
-  /// Not by torch, whose threads spin while they wait for each other.
+  /// Not by torch, whose threads spin while waiting.
   static Tensor make_zeros_like(const Tensor& contiguous) {
     const Tensor out = at::empty_like(contiguous);
     T* const numbers = pointer<T>(out);

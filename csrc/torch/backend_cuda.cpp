@@ -1,5 +1,5 @@
-// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. The host waits only to count
-// pairs (counting_of(), pair_guess.h), to time stages, for tiles_share_lists(), and with debug.
+// Backend for CUDA tensors of float32: launches the stages of csrc/cuda. The host waits only to count pairs
+// (counting_of(), pair_guess.h), to time stages, for tiles_share_lists(), and with debug.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/zeros.h>
@@ -205,8 +205,8 @@ class CudaBackend final : public Backend {
     p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
     if (p.gaussians.n == 0) return;
     side_.emplace(stream_);
-    // Blocks of blend_vjp must start later: they stay until no work is left. In a captured graph only a kernel can wait
-    // for that; the next node may be none.
+    // Blocks of blend_vjp must start later: they stay until no work is left. In a graph only a kernel can wait for
+    // that; the next node may be none.
     const bool ordered = !is_capturing(stream_);
     cuda::zero_culled_grads(p, side_->stream(), ordered ? side_->begun() : nullptr);
     if (ordered) side_->wait_until_begun();
@@ -340,10 +340,9 @@ class CudaBackend final : public Backend {
   double lap() override { return laps_.next(stream_); }
 
  private:
-  /// The caller's stream waits for the side stream.
   void join() { side_.reset(); }
 
-  /// Raises the error of a launch or, with `wait`, of the stage.
+  /// Raises errors of launches or, with `wait`, of the stage.
   void check_stage(const char* stage, bool wait) const {
     cudaError_t error = cudaGetLastError();
     if (wait && error == cudaSuccess) error = cudaStreamSynchronize(stream_);

@@ -1,4 +1,4 @@
-// Arguments of ops with several cameras, or batches of Gaussians: checked, and those of one camera.
+// Arguments of ops with several cameras, or batches of Gaussians.
 #include <string>
 #include <type_traits>
 

@@ -1,5 +1,5 @@
-// The class Call of _C: calls an op of many arguments in a fraction of the time of torch.ops, which reads the schema
-// every time. Autograd and tracing modes work; __torch_function__ does not.
+// The class Call of _C: calls an op of many arguments faster than torch.ops, which reads the schema every time.
+// Autograd and tracing modes work; __torch_function__ does not.
 #include "torch/call.h"
 
 #include <ATen/core/dispatch/Dispatcher.h>

@@ -1,5 +1,5 @@
 // The ops prepare_cameras and prepare_lens (core/camera/prepare.h), and their adjoints. Numbers stay on the host,
-// tensors on their device. Limits of a lens are found once if the host knows its numbers, else by the device in every
+// tensors on their device. A lens's limits are found once if the host knows its numbers, else by the device in every
 // frame.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/empty.h>
@@ -227,7 +227,7 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> arguments) {
 namespace {
 
 using L = Lens<float>;
-/// Numbers of a lens, and how many an argument has, in the order of PrepareLensArguments::each_part().
+/// Numbers of a lens, and of each argument, as in PrepareLensArguments::each_part().
 struct LensPart {
   size_t offset;
   int64_t count;

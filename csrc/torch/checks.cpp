@@ -1,5 +1,5 @@
-// The checks of checks.h for rendering with one camera: shapes, types and values of arguments, lists and saved tensors.
-// And of a footprint's name (find_footprint()) and a picture's size (grid_of()).
+// The checks of checks.h for rendering with one camera, of a footprint's name (find_footprint()) and a picture's size
+// (grid_of()).
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>
@@ -340,7 +340,7 @@ void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_image_size(a.image_height, a.image_width);
   check_countable(a.summary, a.image_height, a.image_width);
   check_lists(lists, lists.splats, pass);
-  // The results are indexed by ids on the CPU and by splats on CUDA.
+  // Results are indexed by ids on the CPU, by splats on CUDA.
   const int64_t n = lists.splats.size(0);
   const bool by_id = !lists.splats.is_cuda() && n > 0;
   TORCH_CHECK_VALUE(!by_id || lists.ids.min().item<int64_t>() >= 0, "ids must not be negative");
@@ -369,7 +369,7 @@ Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t output
   const Tensor& gradient = *dL_doutputs[output];
   Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  return gradient.resolve_neg().contiguous();  // The dispatcher resolves none in a list of optional tensors.
+  return gradient.resolve_neg().contiguous();  // The dispatcher resolves none in lists of optional tensors.
 }
 
 Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,

@@ -1,5 +1,5 @@
-// What the ops accept, on every device, checked before they touch anything. A wrong dtype raises TypeError, anything
-// else ValueError: `means3D must have shape (P, 3), got (5, 2)`.
+// What ops accept, checked before they touch anything. A wrong dtype raises TypeError, anything else ValueError:
+// `means3D must have shape (P, 3), got (5, 2)`.
 #pragma once
 
 #include "torch/backend.h"
@@ -9,7 +9,7 @@ namespace ar::ops {
 
 /// Afterwards every tensor is contiguous, and matrices are 4x4.
 void check(Inputs& in);
-/// Raises in the order along rays, with which `what` cannot be combined.
+/// Raises in the order along rays, which excludes `what`.
 void refuse_rays(const Pass& pass, const char* what);
 void check(RasterizeArguments& a);
 /// The camera's numbers are finite. On CUDA, where the host waits, only with `debug`.
@@ -38,7 +38,7 @@ ProjectArguments batch_of(const BatchArguments& a);
 Inputs inputs_of(const ProjectArguments& a, int64_t c);
 /// What camera c reads of a tensor whose rows have `dims` dimensions in one batch.
 Tensor part_of(const ProjectArguments& a, int64_t c, const Tensor& t, int64_t dims);
-/// Of all tensors of Gaussians, which have the shapes of those of `a`. T: Tensor or OptionalTensor.
+/// Of tensors of Gaussians with the shapes of `a`. T: Tensor or OptionalTensor.
 template <class T> void take_parts(const ProjectArguments& a, int64_t c, SceneTensors<T>& of);
 /// Of `t`, which is `values` or like it.
 inline Tensor values_of(const ProjectArguments& a, int64_t c, const Tensor& t) { return part_of(a, c, t, 2); }

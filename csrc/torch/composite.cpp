@@ -1,5 +1,4 @@
-// The op `composite`, rows of one or several cameras to their images: `bin` and `blend` (stages.cpp) in one, with
-// channels last. And its adjoint.
+// The op `composite`, rows to images: `bin` and `blend` (stages.cpp) in one, channels last. And its adjoint.
 #include <ATen/ops/where.h>
 #include <ATen/ops/zeros_like.h>
 

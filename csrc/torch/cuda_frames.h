@@ -1,5 +1,4 @@
-// What backend_cuda.cpp keeps beyond a call: SharedGuesses (pair_guess.h) and Laps, a clock. And whether a frame's
-// pairs are counted.
+// What backend_cuda.cpp keeps beyond a call: SharedGuesses (pair_guess.h) and Laps, a clock.
 #pragma once
 
 #include <ATen/ops/empty.h>
@@ -41,7 +40,7 @@ inline bool is_capturing(cudaStream_t stream) {
 }
 
 /// From here on, frames of samples that move are counted for a backward pass: a pair takes hundreds of bytes of
-/// checkpoints, waiting little of such a frame.
+/// checkpoints, waiting little time.
 inline constexpr int64_t kCountedGaussians = 1 << 23;
 
 inline cuda::Counting counting_of(const Pass& pass, int64_t gaussians, cudaStream_t stream) {

@@ -1,5 +1,5 @@
-// Tensors as structs of the CUDA kernels. SplatMemory, PairMemory and PlanMemory put arrays into one tensor: a tensor
-// costs the host microseconds. The checks are of sizes that checks.h cannot know.
+// Tensors as structs of the CUDA kernels. SplatMemory, PairMemory and PlanMemory put arrays into one tensor: each costs
+// the host microseconds. Checks sizes that checks.h cannot know.
 #pragma once
 
 #include <utility>
@@ -48,7 +48,7 @@ std::pair<Tensor, Parts> make_memory(const at::TensorOptions& bytes, const Argum
   return {memory, Parts(memory, arguments...)};
 }
 
-/// What `project` and `shape_rows` write for bin, and bin's own memory.
+/// What `project` or `shape_rows` and bin write.
 struct SplatMemory {
   std::byte *depth_scratch, *emit_scratch;
   cuda::ZeroedMemory to_clear = {};  ///< Both, without the histograms, which are clear.

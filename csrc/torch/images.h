@@ -8,8 +8,7 @@
 
 namespace ar::ops {
 
-/// Images besides the colours, in the order of `rasterize`. Backend::writes() says which a device makes. Python reads
-/// _C.IMAGES.
+/// Images besides the colours, in the order of `rasterize`: _C.IMAGES.
 enum ImageIndex : size_t { kAlpha, kDepth, kInverseDepth, kImageCount };
 inline constexpr std::array<const char*, kImageCount> kImageSwitches = {"alpha=False", "depth=False",
                                                                         "inverse_depth=False"};

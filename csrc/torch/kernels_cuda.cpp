@@ -1,5 +1,5 @@
-// For tests, functions of _C about kernels: launched_kernels(), the names of those launched while recording, and
-// blend_route(), those of cuda/dispatch.h for a footprint.
+// For tests, functions of _C: launched_kernels(), names of kernels launched while recording, and blend_route(), those
+// of cuda/dispatch.h.
 #include <cuda_runtime_api.h>
 
 #include <mutex>

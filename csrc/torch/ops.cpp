@@ -1,5 +1,5 @@
-// Registers the ops of ops.h with torch: a schema made from the arguments, and one kernel for all devices. And the
-// Python module _C, with names, widths, and functions that are no ops.
+// Registers the ops of ops.h with torch: a schema made from the arguments, and one kernel for all devices. And makes
+// the Python module _C.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>
@@ -25,7 +25,7 @@ namespace {
 
 using torch::jit::Stack;
 
-/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Only its message tells it from others.
+/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Its message tells it from others.
 template <class Work> auto with_memory_errors(const Work& work) {
   try {
     return work();
@@ -182,7 +182,7 @@ pybind11::dict row_columns() {
   return columns;
 }
 
-/// Numbers in a row of the tensors that ops save, on CUDA where devices differ.
+/// Widths of tensors that ops save, on CUDA where devices differ.
 pybind11::dict saved_widths() {
   pybind11::dict widths;
   widths["splats"] = kSplatWidth;

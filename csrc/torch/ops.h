@@ -1,5 +1,5 @@
-// The ops, registered in ops.cpp, made differentiable in autograd.cpp and cast to float32 in autocast.cpp. Comments
-// list results in the order of the schema.
+// The ops, registered in ops.cpp, differentiable by autograd.cpp, cast to float32 by autocast.cpp. Comments list
+// results in order.
 #pragma once
 
 #include <string>
@@ -26,8 +26,8 @@ Results prepare_cameras_vjp(VjpArguments<PrepareCamerasArguments> a);
 /// lens (kLensWidth,).
 Results prepare_lens(PrepareLensArguments a);
 Results prepare_lens_vjp(VjpArguments<PrepareLensArguments> a);
-/// The angles up to which a lens is a map, and its Jacobian not clamped, rad; only an equirectangular lens needs
-/// `height`, px.
+/// Angles up to which a lens is a map, and its Jacobian not clamped, rad; only an equirectangular lens needs `height`,
+/// px.
 double lens_fold(const std::string& model, const std::vector<double>& distortion);
 double lens_reach(const std::string& model, const std::vector<double>& distortion, double tan_x, double tan_y, double x,
                   double y, int height);

@@ -1,6 +1,6 @@
 // The ops of rendering over several ranks. On the rank of the Gaussians, count_rows and pack_rows_ make PackedRows,
-// which Python sends. On the rank of the camera, blend_rows bins and blends. The adjoints, blend_rows_vjp_ and
-// pack_rows_vjp, lead back. Rows of all cameras are counted before memory is allocated, without waiting.
+// which Python sends. On the rank of the camera, blend_rows bins and blends. Adjoints are blend_rows_vjp_ and
+// pack_rows_vjp. Rows of all cameras are counted before memory is allocated, without waiting.
 #include <ATen/ops/cumsum.h>
 #include <ATen/ops/zeros.h>
 

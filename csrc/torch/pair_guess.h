@@ -1,5 +1,4 @@
-// How much room to reserve for the pairs of a frame, guessed from earlier ones. The device writes the number into host
-// memory, where a later frame reads it.
+// Guesses room for a frame's pairs from earlier frames, whose numbers the device has written into host memory.
 #pragma once
 
 #include <algorithm>
@@ -103,7 +102,7 @@ struct ImageClass {
   }
 };
 
-/// Of the classes used last, each with a word that the device writes; by the frame's number it tells if the slot has
+/// Of the classes used last, each with a word that the device writes. The frame's number in it tells if the slot has
 /// another class by then.
 class PairGuesses {
  public:

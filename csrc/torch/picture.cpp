@@ -1,6 +1,5 @@
-// The ops picture_gradients and rows_picture_gradients: rendering and loss of a training's picture, and the gradients
-// of the parameters or, where these are on several ranks, of rows. They call the ops that autograd would, without its
-// cost to the host.
+// The ops picture_gradients and rows_picture_gradients: loss of a training's picture, and gradients of the parameters
+// or, with several ranks, of rows. They call the ops that autograd would, without its cost to the host.
 #include <ATen/ops/avg_pool2d.h>
 #include <ATen/ops/avg_pool2d_backward.h>
 #include <ATen/ops/cat.h>
@@ -66,7 +65,7 @@ struct Rasterized {
   }
 };
 
-/// The same of an equirectangular picture, whose splats are repeated. The host waits for their number.
+/// The same of an equirectangular picture. The host waits for the number of repeated splats.
 struct Sphere {
   RasterizeArguments scene;
   ProjectArguments camera;
@@ -226,7 +225,7 @@ struct Loss {
   }
 };
 
-/// The part of the loss that depths have, that of Huber, and its gradient. Undefined: none.
+/// The loss of depths, Huber's, and its gradient. Undefined: none.
 struct DepthLoss {
   Tensor value, dL_drendered;
 

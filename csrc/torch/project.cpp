@@ -1,5 +1,5 @@
 // The op `project`, Gaussians and cameras to rows, and its adjoint. Rows are packed, one for every Gaussian that a
-// camera may see, and the host waits once for their number; or a table with a place for every Gaussian in every camera.
+// camera may see, and the host waits once for their number; or a table of all Gaussians in all cameras.
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 

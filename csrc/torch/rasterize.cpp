@@ -19,8 +19,8 @@ namespace {
 /// They walk lists in the order of centres.
 constexpr const char* kSummaries = "median_depth, dominant_index and gaussian_stats";
 
-/// What is blended: colours, features, depth, inverse depth. Three colours alone lie in the splats, anything else in
-/// rows: `made` by the forward pass, or new ones.
+/// Three colours alone lie in the splats; colours, features, depth and inverse depth in rows: `made` by the forward
+/// pass, or new.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   const int64_t colors = a.bg.size(0), depths = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
   const bool three = colors == 3;
@@ -193,8 +193,8 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     }
 
     const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
-    // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses what blend_vjp frees. And
-    // before the backend, whose destructor waits.
+    // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses what it frees. And before the
+    // backend, whose destructor waits.
     Grads grads = make_grads(a, needs);
     grads.mean_sums = mean_sums;
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);

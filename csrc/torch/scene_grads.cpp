@@ -113,7 +113,7 @@ Tensor row_of_gaussians(const Tensor& ids, int64_t count, int64_t first) {
 Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state, TileGrid grid) {
   if (!dL_dimage.defined()) return at::zeros_like(background);
   const Tensor dL_dcolor = dL_dimage.narrow(0, 0, background.size(0));
-  // One axis at a time: torch divides sums of 2^15 terms among threads, whose number would change bits.
+  // One axis at a time: torch divides long sums among threads, whose number would change bits.
   const int64_t longer = grid.height > grid.width ? 1 : 2;
   return dL_dcolor.mul(state.transmittance.mean(0)).sum(longer).sum(1);
 }

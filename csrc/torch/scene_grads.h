@@ -1,5 +1,5 @@
-// Gradients of Gaussians, cameras and background: allocates what backends write, adds up several cameras, and lists
-// tensors as ops return them. `needs`: the wanted SceneTensors.
+// Gradients of Gaussians, cameras and background: allocates them, adds up cameras, and lists tensors as ops return
+// them. `needs`: the wanted SceneTensors.
 #pragma once
 
 #include <functional>

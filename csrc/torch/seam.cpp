@@ -1,7 +1,7 @@
-// The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are the same line of the
-// sphere, with a row for every place at which a splat may show (docs/internals/numerics.md, "Equirectangular
-// pictures"). And its adjoint. A splat wider than the turn overlaps itself: the opacity of its copies is lowered, to be
-// together what it was at the centre.
+// The op repeat_at_seam: rows of equirectangular pictures, whose left and right borders are one line, with a row for
+// every place at which a splat may show (docs/internals/numerics.md, "Equirectangular pictures"). And its adjoint. A
+// splat wider than the turn overlaps itself: the opacity of its copies is lowered, to be together what it was at the
+// centre.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/exp.h>

@@ -1,5 +1,5 @@
-// The ops of a training step besides rendering: loss, activations, 3D filter, colour correction, density control
-// (observe_, add_noise_) and optimiser, with adjoints.
+// Ops of a training step: loss, activations, 3D filter, colour correction, density control (observe_, add_noise_) and
+// optimiser, with adjoints.
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -181,7 +181,7 @@ Results adam(AdamArguments a) {
   check(a);
   if (a.params.empty()) return {};
   const std::initializer_list<std::vector<Tensor>*> written = {&a.params, &a.exp_avgs, &a.exp_avg_sqs};
-  // Kernels take contiguous tensors: of others they get copies, which are copied back.
+  // Kernels take contiguous tensors: others are copied, and back.
   std::vector<std::pair<Tensor, Tensor>> copied;
   for (std::vector<Tensor>* list : written) {
     for (Tensor& t : *list) {

@@ -1,5 +1,5 @@
-// TrainingKernels: what the ops of training.cpp ask of a device, and parameters of kernels from tensors. Tensors are
-// checked and contiguous, or undefined: absent or not wanted.
+// TrainingKernels, which training.cpp asks of a device, and parameters of kernels from tensors, checked and contiguous,
+// or undefined: absent or not wanted.
 #pragma once
 
 #include <cmath>

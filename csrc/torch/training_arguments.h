@@ -76,9 +76,9 @@ struct CorrectArguments {
 /// How a rendering becomes a loss.
 struct LossArguments {
   Tensor target, dL_dloss;     ///< As of `l1_ssim`.
-  OptionalTensor exposure;     ///< (3, 4): a rendered colour c becomes its first three columns times c plus the last.
-  OptionalTensor vignetting;   ///< (2,): see core/color_correction.h.
-  std::vector<double> center;  ///< With it: x and y of the principal point of the target, px.
+  OptionalTensor exposure;     ///< (3, 4): see core/color_correction.h.
+  OptionalTensor vignetting;   ///< (2,): as well.
+  std::vector<double> center;  ///< With it: x and y of the target's principal point, px.
   OptionalTensor mask;         ///< (H, W) of the share of each pixel that counts: a factor of both images.
   double ssim_weight = 0;
   int64_t supersampling = 1;  ///< The target has so many times fewer rows and columns, of means over the rendering.

@@ -20,7 +20,7 @@ std::vector<std::pair<int64_t, int64_t>> extents_of(const Tensor& t) {
   return extents;
 }
 
-/// As in an expanded tensor. Not if each stride exceeds what lies within the dimensions of smaller strides.
+/// As in an expanded tensor. Not if each stride exceeds what lies within smaller ones.
 bool may_overlap_itself(const Tensor& t) {
   auto extents = extents_of(t);
   std::sort(extents.begin(), extents.end(), [](const auto& x, const auto& y) { return x.second < y.second; });

@@ -1,6 +1,6 @@
-// The types Camera, FullCamera and CameraGrad, and the contract of a camera model: the map from the world to pixels,
-// its Jacobian, and the adjoints of both. A model is a struct of static functions in its own header, and an entry of
-// the list in models.h. Only core/camera.h, motion.h and defocus.h call it. pinhole.h shows the arguments.
+// The cameras, and the contract of a camera model: the map from the world to pixels, its Jacobian, and the adjoints of
+// both. A model is a struct of static functions, listed in models.h. Only core/camera.h, motion.h and defocus.h call
+// it. pinhole.h shows the arguments.
 //
 // `camera` is a Camera or a FullCamera, `mean` a point of the world, `view` the same point in camera space, p a
 // ProjectedMean. Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
@@ -53,7 +53,7 @@ template <typename T> AR_HD void add_row_vjp(Vec4<T>& to, T dL_dvalue, Vec3<T> p
 }
 template <typename T> AR_HD void add_xyz(Vec4<T>& to, Vec3<T> v) { to = {to.x + v.x, to.y + v.y, to.z + v.z, to.w}; }
 
-/// The plain camera, a pinhole: rows of matrices, loaded once per thread.
+/// The plain camera, a pinhole.
 template <typename Scalar> struct Camera {
   static constexpr bool kFull = false;
   static constexpr int kShDegree = 3;   ///< the largest; coefficients take registers
@@ -87,7 +87,7 @@ template <typename T> AR_HD bool in_range(const FullCamera<T>& camera, T z) {
 
 template <typename T> struct ProjectedMean {
   Vec3<T> view;  ///< camera space
-  Vec2<T> ndc;   ///< of ClipSpaceMap, as is clip_w
+  Vec2<T> ndc;   ///< of ClipSpaceMap, as clip_w
   T clip_w;
   Vec2<T> pixel;
   bool valid;  ///< map() is true, and numbers are finite

@@ -1,8 +1,8 @@
 // The equirectangular picture: columns are longitudes, rows are latitudes; the whole sphere has a focal length of w /
 // (2 pi), h / pi px.
 //
-// Towards a pole the derivative of the longitude grows without bound. `reach` is the largest 1 / cos(latitude): nearer
-// to a pole derivatives are those at that latitude (docs/internals/numerics.md, "Equirectangular pictures").
+// Towards a pole the longitude's derivative grows without bound. `reach` is the largest 1 / cos(latitude): nearer to a
+// pole derivatives are those there (docs/internals/numerics.md, "Equirectangular pictures").
 #pragma once
 
 #include "core/camera/lens_model.h"

@@ -1,9 +1,9 @@
-// Makes all of core/camera/contract.h from the map of a lens. The Jacobian is the exact derivative of the map, but for
-// one clamp: beyond `reach` it is that of a ray turned back to `reach`, as 3DGS does with pinholes. Second derivatives
-// come from numbers of derivatives.h.
+// Makes a model (contract.h) from the map of a lens. The Jacobian is the exact derivative of the map, but for one
+// clamp: beyond `reach` it is that of a ray turned back to `reach`, as 3DGS does with pinholes. Second derivatives come
+// from numbers of derivatives.h.
 //
-// A model inherits PerspectiveLens, DistanceLens or WideLens, which inherit LensModel, and defines, for S float, double
-// or a Line, and N an S or a Dual<S>:
+// A model inherits PerspectiveLens, DistanceLens or WideLens, and defines, for S float, double or a Line, and N an S or
+// a Dual<S>:
 //
 //   image_point(Vec3<N> p, const S* k)   where p is seen, in focal lengths from the principal point; k: distortion
 //   turned_back(lens, p)                 p, or if beyond lens.reach a point there
@@ -239,8 +239,8 @@ template <class Model> struct WideLens : DistanceLens<Model> {
   template <typename T> AR_HD_CALL static T angle(Vec3<T> p) { return std::atan2(sqrt(p.x * p.x + p.y * p.y), p.z); }
 };
 
-/// Tangential terms p1, p2 and thin prism terms s1 to s4 of OpenCV, k = {p1, p2, s1, s2, s3, s4}, added to the point
-/// (x, y) of the undistorted (a, b).
+/// Tangential and thin prism terms of OpenCV, k = {p1, p2, s1, s2, s3, s4}, added to the point (x, y) of the
+/// undistorted (a, b).
 template <class N, class S> AR_HD Vec2<N> decentered(Vec2<N> to, N a, N b, const S* k) {
   const N r2 = a * a + b * b, r4 = r2 * r2, ab = a * b;
   const S two = S(2);

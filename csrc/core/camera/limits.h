@@ -70,8 +70,8 @@ AR_HD double limit_angle(double first, double last, int k) {
   return k == kLimitAngles ? last : first + (last - first) * k / kLimitAngles;
 }
 
-/// The angle before which the lens is a map in one direction, 0 for none. find(first, last): the number of the first of
-/// these angles where it is none, else kLimitAngles + 1.
+/// The angle before which the lens is a map in one direction, or 0. find(first, last): the first of these angles where
+/// it is none, else kLimitAngles + 1.
 template <class Find> AR_HD double fold_in_direction(LimitKind kind, const Find& find) {
   double first = 0, last = widest_angle(kind);
   for (int pass = 0; pass < 2; ++pass) {  // the second between two neighbours of the first

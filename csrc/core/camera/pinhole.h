@@ -1,5 +1,5 @@
-// The pinhole, the model of a plain camera, with all formulas that assume f/z. As in 3DGS the Jacobian clamps x/z and
-// y/z, so that splats beside the image do not grow without bound.
+// The pinhole, the model of a plain camera. As in 3DGS the Jacobian clamps x/z and y/z: splats beside the image do not
+// grow without bound.
 #pragma once
 
 #include "core/camera/clip_space.h"

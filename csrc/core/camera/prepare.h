@@ -1,5 +1,5 @@
-// From a user's camera to what kernels read, and the adjoint: the matrices of a pose and intrinsics (CameraSource), and
-// a Lens of numbers and tensors (LensSource). In double, rounded once.
+// From a user's camera to what kernels read, and the adjoint: matrices of a pose and intrinsics (CameraSource), a Lens
+// of numbers and tensors (LensSource). In double, rounded once.
 #pragma once
 
 #include "core/camera/limits.h"
@@ -8,13 +8,13 @@ namespace ar {
 
 inline constexpr double kClipNear = 0.01, kClipFar = 100;  ///< of clip-space z, which nothing reads
 
-/// The limits of lenses, rad; what is not known is found (limits.h).
+/// Limits of lenses, rad; limits.h finds what is not known.
 struct KnownLimits {
   double fold = 0, reach = 0;  ///< 0: not known
   int height = 0;              ///< of the picture [px]
 };
 
-/// Where numbers of a lens are tensors; null: they are not.
+/// Tensors of numbers of a lens, or null.
 template <typename T> struct LensTensors {
   const T *tan_half_fov_x, *tan_half_fov_y, *aperture, *focus, *shift, *turn, *screen, *distortion;
   const T *view, *proj;  ///< [16] transposed: they tell the middle of the picture
@@ -141,7 +141,7 @@ template <typename T> struct CameraSource {
   }
   AR_HD T* lens_of(int c) const { return out + kLensWidth * c; }
 
-  /// Of the inverse of the rotation: columns, which are divided by `det`.
+  /// Columns of the rotation's inverse times `det`.
   struct Inverse {
     Vec3<double> x, y, z;
     double det;
@@ -180,7 +180,7 @@ template <typename T> struct CameraSource {
   }
 };
 
-/// By what CameraSource wrote, null for none, and by what it read.
+/// By what CameraSource wrote (null: none), and read.
 template <typename T> struct CameraSourceGrads {
   const T *viewmatrix, *projmatrix, *position, *lens;
   T *views, *intrinsics, *coefficients;  ///< the last may be null

@@ -1,6 +1,5 @@
-// The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
-// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. The forms are those of docs/internals/numerics.md,
-// "Logistic window".
+// The footprint `analytic`: the Gaussian over a unit pixel turned into its eigenframe, with a logistic approximation of
+// the CDF [AS, Eq. 2-9]. Forms are those of docs/internals/numerics.md, "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -11,7 +10,7 @@ namespace ar {
 inline constexpr double kLogistic1 = 1.6;
 inline constexpr double kLogistic3 = 0.07;
 
-/// Least standard deviation [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
+/// Least standard deviation [px]: r^3 fits a float. Thinner splats have weights below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
 /// Along an axis, t = u/sigma.

@@ -1,5 +1,4 @@
-// The footprint `box`: the pixel as S equal Gaussians at the nodes of box_node<S>, each with its own transmittance. The
-// pixel's colour is the mean over the samples.
+// The footprint `box`: the pixel as S equal Gaussians at the nodes of box_node<S>, each with its own transmittance.
 #pragma once
 
 #include "core/footprint/gaussian.h"

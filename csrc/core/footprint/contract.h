@@ -1,6 +1,5 @@
 // The contract of a footprint: from a projected Gaussian to its weight I in a pixel. A footprint F is a struct of
-// static functions and constants, and a line in registry.h; all else gets F as a template argument. See
-// docs/internals/adding-a-footprint.md.
+// static functions and constants, and a line in registry.h (docs/internals/adding-a-footprint.md).
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
 // centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
@@ -8,7 +7,7 @@
 // Constants, with defaults in FootprintDefaults:
 //
 //   kName         the name for users: "box"
-//   kKey          a unique key: "box4", since footprints of one name differ in an option. Default: the name
+//   kKey          a unique key: "box4". Default: the name
 //   kOption       that option
 //   kReference    true: for comparisons; the CPU compiles it for one instruction set
 //   kGeneric      true: CUDA has only the slower kernels, for any number of channels
@@ -19,9 +18,9 @@
 //   Pixels        a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled once for
 //                 all footprints that name this type; void: for F
 //   kSamples      samples of a pixel, each with its own transmittance
-//   Spread        a type for one sample, with the same Shape, ellipse and level. CUDA compiles kernels for it where
-//                 spread_grid() of core/stages.h has small tiles: lane s blends the sample at node(s), and p (below) is
-//                 the position of that sample; void: none
+//   Spread        a type for one sample, with the same Shape, ellipse and level, for CUDA where spread_grid() of
+//                 core/stages.h has small tiles: lane s blends the sample at node(s), and p (below) is its position;
+//                 void: none
 //   kLanes        of a Spread: the samples of a pixel
 //   kReach        largest |coordinate| of a node [px]
 //   kExtraLevel   no level (below) exceeds 2 ln(255 opacity) + kExtraLevel
@@ -60,8 +59,7 @@
 //   alpha_and_move_vjp          the adjoint of both. `free`: alpha is not capped; `moved`: before the splat;
 //                               dL_dmoved: read as after the splat, written as before it
 //
-// Blending calls them by whitened coordinates z. `place` is the position of a sample, node + displacement, relative to
-// the pixel centre.
+// In whitened coordinates z. `place` is a sample's position, node + displacement, relative to the pixel centre.
 //
 //   cell                        limits of the position of sample s
 //   whitened, whitened_row      z of the point p, and of (0, y)
@@ -115,15 +113,15 @@ struct Option {
   const char* name = nullptr;   ///< null: no option
   const char* value = nullptr;  ///< selects this footprint; null: a number
   double number = 0;            ///< its default
-  bool is_default = true;       ///< used if the option is not given
+  bool is_default = true;
 };
 
-/// `weighted` is alpha dL_dalpha. A footprint uses either.
+/// `weighted` is alpha dL_dalpha.
 template <class V> struct AlphaGrad {
   V dL_dalpha, weighted;
 };
 
-/// Sums over pixels, as the footprint defines them.
+/// Sums over pixels.
 template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;
@@ -136,12 +134,11 @@ template <class V> struct Bounds {
   Vec2<V> lo, hi;
 
   static constexpr int kUnits = 1;  ///< of length per pixel
-  /// at + length along, clamped.
   AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
     const Vec2<V> next = {madd(length, along.x, at.x), madd(length, along.y, at.y)};
     return {min(max(next.x, lo.x), hi.x), min(max(next.y, lo.y), hi.y)};
   }
-  /// Whether the clamp leaves a coordinate as it is.
+  /// Not clamped.
   AR_HD MaskOf<V> free_x(V x) const { return (x >= lo.x) & (x <= hi.x); }
   AR_HD MaskOf<V> free_y(V y) const { return (y >= lo.y) & (y <= hi.y); }
 };

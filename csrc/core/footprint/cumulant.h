@@ -73,7 +73,7 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
-  /// The tests check this bound (docs/internals/numerics.md, "Support").
+  /// See docs/internals/numerics.md, "Support".
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     const T a = conic_xx(shape.w), c = conic_yy(shape.w);
     return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);

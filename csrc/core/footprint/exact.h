@@ -1,4 +1,4 @@
-// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel.
+// The footprint `exact`, a reference.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -7,7 +7,7 @@
 namespace ar {
 
 /// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d, by quadrature
-/// with positive weights. docs/internals/numerics.md, "The exact integral", has the rules and error bounds.
+/// with positive weights (docs/internals/numerics.md, "The exact integral").
 ///
 /// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
 /// `tilt`. A Gaussian narrow across the ridge z.y = 0 is integrated in strips around where the pixel's edges cross it.

@@ -1,6 +1,6 @@
-// Shared by the footprints that are Gaussians: point, mip, box and moment, and in part by others. Stored is a whitening
-// matrix w, w^T w = (Sigma + v I)^-1: the exponent -|w d|^2 / 2 is never positive, and does not cancel for long needles
-// as the conic form does (docs/internals/numerics.md, "Whitening").
+// Shared by point, mip, box and moment, and in part by others. Stored is a whitening matrix w, w^T w = (Sigma + v
+// I)^-1: the exponent -|w d|^2 / 2 is never positive, and does not cancel for long needles as the conic form does
+// (docs/internals/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"

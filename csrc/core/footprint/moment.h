@@ -89,8 +89,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {V(t.node[0].x), madd(V(t.w.yy), y, V(t.node[0].y))};
   }
 
-  /// move() by whitened coordinates z. `at` is the position or displacement of the node, in the unit of w^-1. `mask`:
-  /// the splat was composited; alpha may be nonzero where it was not.
+  /// move() by whitened coordinates z. `at`: the node's position or displacement, in the unit of w^-1. `mask`: the
+  /// splat was composited; alpha may be nonzero where it was not.
   template <typename T, class V, class Cell>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
     const Vec2<V> along = transform_transposed(t.w, z);

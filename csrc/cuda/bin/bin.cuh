@@ -1,7 +1,7 @@
-// Kernels that make the lists of tiles; forward.cu launches them. count_depths counts splats, pairs and digits of
-// depths, and gives splats slots for gradients. After the sort by depth (sort.cuh), emit_pairs writes a pair for each
-// tile of a splat, emit_long_pairs of splats whose tiles are not among 8x8, or of patches where room is short. After
-// the sort by tile, tile_offsets finds the first pair of each tile.
+// Kernels that make the lists of tiles. count_depths counts splats, pairs and digits of depths, and gives splats slots
+// for gradients. After the sort by depth (sort.cuh), emit_pairs writes a pair for each tile of a splat, emit_long_pairs
+// of splats whose tiles are not among 8x8, or of patches where room is short. After the sort by tile, tile_offsets
+// finds the first pair of each tile.
 #pragma once
 
 #include <type_traits>
@@ -28,8 +28,8 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
   return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
 }
 
-/// Hands out slots to kRows x 32 splats of a warp, and counts them. `ranges`: of the lane's first splat; the next is
-/// `stride` later.
+/// Hands out slots to kRows x 32 splats of a warp, and counts them. `ranges`: of the lane's first splat, `stride`
+/// apart.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -182,10 +182,10 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// In EmitParams::status: blocks that have begun; long splats; counts of blocks.
+/// EmitParams::status: blocks that have begun; long splats; counts of blocks.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// In order of depth, then rows of tiles. Long splats (tiles beyond 8x8) are only listed.
+/// In order of depth, then rows of tiles. Long splats are only listed.
 __global__ void __launch_bounds__(BinPolicy::kEmitThreads,
                                   blocks_per_sm(BinPolicy::kEmitBlocks, BinPolicy::kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
@@ -305,7 +305,7 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kThreads - 1) / kThreads * kThreads;
   const auto tiles_of_splat = [&](int32_t id) { return box_of_tiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side, or one for the whole image.
+  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side, or one for all.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4

@@ -1,5 +1,5 @@
-// How lists are cut into chunks (front_chunks, ListCut), the order of work (ChunkPlan), and how checkpoints of still/
-// lie in memory (CheckpointLayout). Kernels of plan.cuh write the plan, those of blending read it.
+// How lists are cut into chunks (front_chunks, ListCut), the order of work (ChunkPlan, written by plan.cuh), and where
+// checkpoints of still/ lie (CheckpointLayout).
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace ar::cuda {
 
-/// Blocks of 256 threads that fill a multiprocessor. Last bits depend on it, by front_chunks().
+/// Blocks of 256 threads that fill a multiprocessor. Results depend on it in last bits.
 inline constexpr int kBlocksPerSm = 8;
 /// Pairs of a chunk of still/: the work of a warp of blend_vjp.
 inline constexpr int kChunkLength = 256;
@@ -18,8 +18,8 @@ inline constexpr int kWholeList = 1 << 30;
 inline constexpr int kNoList = 1 << 30;
 
 /// Chunks in the front of a tile. The others, the tail, are blended side by side, which is more work. The front is
-/// short if the tiles cannot fill the device, else a block's share of all `pairs` or more: fewer than blocks_at_once
-/// tiles have a tail.
+/// short if tiles cannot fill the device, else a block's share of `pairs` or more: fewer than blocks_at_once tiles have
+/// a tail.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more pairs there are patches
   if (2 * grid.tiles() <= blocks_at_once) return StillPolicy::kShortFront;
@@ -36,7 +36,7 @@ struct ListCut {
   int max_segments = 0, max_lists = 0;        ///< room; 0: no list is long
   int longest_from = kNoList;                 ///< pairs of the longest lists: a power of two; 0: all lists
 
-  /// Most segments if all lists have `pairs`. Not by room, so that the same lists are always cut alike.
+  /// Most segments if all lists have `pairs`. Not by room: the same lists are cut alike.
   AR_HD int64_t segment_limit(int64_t pairs) const {
     if (at_least == 0) return max_segments;
     const int64_t all = pairs / segment + pairs / at_least;

@@ -8,7 +8,7 @@
 
 namespace ar::cuda {
 
-/// Longer work has a lower class, and begins first. The order in a class is arbitrary.
+/// Longer work has a lower class, and begins first.
 __device__ inline int work_class(int length) { return __clz(length); }
 
 /// The next index in class `of`, if `wanted`, with an atomic per class of a warp.
@@ -80,7 +80,7 @@ template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of
   return size;
 }
 
-/// Classes of long lists are cut, longest first, up to the limit of segments.
+/// Long lists are cut, longest class first, up to the limit of segments.
 struct CutClasses {
   int lists = 0, segments = 0, longest = 0;
   int chunks_of_class;  ///< of this thread's class

@@ -1,13 +1,13 @@
-// Launch shapes and lengths of loops in the kernels of bin/, chosen by measuring, with what they trade.
+// Launch shapes and lengths of loops of bin/, as measured, with what they trade.
 #pragma once
 
 namespace ar::cuda {
 
 struct BinPolicy {
-  /// count_depths: few blocks, because each adds a histogram. Keys loaded at once: registers against waiting.
+  /// count_depths: few blocks, as each adds a histogram. Keys loaded at once: registers against waiting.
   static constexpr int kCountThreads = 1024, kCountBlocksPerSm = 1, kCountAtOnce = 4;
 
-  /// emit_pairs: splats of a thread, for few blocks, because each waits for the one before.
+  /// emit_pairs: splats of a thread, for few blocks, as each waits for the one before.
   static constexpr int kEmitThreads = 256, kEmitRows = 2, kEmitSplats = kEmitThreads * kEmitRows;
   /// Limits a thread to 48 registers.
   static constexpr int kEmitBlocks = 5;

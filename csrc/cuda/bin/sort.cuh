@@ -1,5 +1,5 @@
-// A pass of a stable radix sort, for a number of items that only the device knows: "Onesweep" of Adinets and Merrill
-// (2022), where a block adds up what earlier ones have published.
+// A pass of a stable radix sort of a number of items that only the device knows: "Onesweep" [Adinets and Merrill 2022],
+// where a block adds up what earlier ones have published.
 #pragma once
 
 #include "cuda/bin/policy.h"
@@ -139,7 +139,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   const int64_t block = shared.block, begin = block * D::kTile;
   if (begin >= n) return;
 
-  // A warp's items are consecutive, in rows of 32: equal digits keep their order.
+  // A warp's items are consecutive: equal digits keep their order.
   const int64_t first = begin + warp * 32 * kItems + lane;
   const bool whole = begin + D::kTile <= n;
   uint32_t keys[kItems];

@@ -1,4 +1,4 @@
-// Launches blend_groups (groups.cuh): the forward pass for any number of channels, in groups of 32 or 8.
+// Launches blend_groups (groups.cuh), the forward pass for any number of channels.
 //
 // Tried and lost: docs/internals/log.md, "More than four channels" and "Features that are gone".
 #include "cuda/channels/groups.cuh"

@@ -1,4 +1,4 @@
-// Launches blend_groups_vjp (groups_vjp.cuh): the backward pass of one group of channels.
+// Launches blend_groups_vjp (groups_vjp.cuh), the backward pass of a group of channels.
 #include "cuda/channels/groups_vjp.cuh"
 
 namespace ar::cuda {

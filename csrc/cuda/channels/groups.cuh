@@ -1,5 +1,5 @@
 // Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, at the end, 8. A block per tile
-// and group walks the whole list, and writes images, `transmittance` and `last`.
+// and group walks the whole list.
 #pragma once
 
 #include "cuda/channels/policy.h"
@@ -101,7 +101,7 @@ template <int C> struct ChannelShare {
     }
     return sums[0];
   }
-  /// Of weighted_sum(): the channel of this lane; whether it is the first with it.
+  /// This lane's channel of weighted_sum(); whether it is the first with it.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };

@@ -1,4 +1,4 @@
-// Batches and resident blocks of channels/, chosen by measuring, with what they trade.
+// Batches and resident blocks of channels/, as measured, with what they trade.
 #pragma once
 
 namespace ar::cuda {

@@ -1,7 +1,6 @@
-// What the kernels of moment/ share. A pixel has F::kSamples square cells, each with a sample, evaluated at a node that
-// moves in the cell with every splat composited. CellLayout says which lane has which samples, MovingSamples is their
-// state and its checkpoints, MovingStage a batch of splats in shared memory, and MovingBlend the forward pass of a
-// lane.
+// What moment/ shares. A pixel has F::kSamples square cells, each with a sample at a node that moves in it with every
+// splat composited. CellLayout says which lane has which samples, MovingSamples is their state and checkpoints,
+// MovingStage a batch of splats in shared memory, MovingBlend the forward pass of a lane.
 //
 // Template parameters in moment/: F is the footprint, C the number of channels, kSide the side of the tiles [px],
 // Layout a CellLayout, kSegment the pairs of a segment. kKeep: for a backward pass. All lanes of a warp must call
@@ -21,9 +20,9 @@ __device__ inline int& claimed_group() {
   return groups[threadIdx.x / 32];
 }
 
-/// A lane has kCellsOfLane neighbouring cells of a row, a pixel kLanesOfPixel neighbouring lanes (a power of two), and
-/// a warp a rectangle of pixels, called a group. kClaimed: warps claim one group after another. kWarpsOfGroup: warps
-/// with different samples of the same pixels.
+/// A lane has kCellsOfLane neighbouring cells of a row, a pixel kLanesOfPixel neighbouring lanes (a power of two), a
+/// warp a rectangle of pixels, a group. kClaimed: warps claim groups. kWarpsOfGroup: warps with different samples of
+/// the same pixels.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
           int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kClaimed = false,
           int kWarpsOfGroup = 1>
@@ -154,7 +153,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   }
 };
 
-/// A splat at a node. All kernels call see(), so that alpha has the same bits.
+/// A splat at a node. All kernels call see(): alpha has the same bits.
 struct Seen {
   Vec2<float> z;
   float raw;
@@ -217,8 +216,8 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
 /// A lane's share of a pixel.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
-  /// Whether the warp first votes if any sample shows the splat: pays with several cells in a lane and few pixels in a
-  /// warp; kKeep needs the registers.
+  /// Whether the warp votes if any sample shows the splat: pays with several cells in a lane and few pixels in a warp;
+  /// kKeep needs the registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   Pixel pixel;
   MovingSamples<F, Layout, kTogether> samples;

@@ -1,5 +1,5 @@
-// Which lists of moment/ are cut into segments, to be worked on side by side, by the size of the image and the room for
-// pairs. ListSegment finds a segment in the chunk plan.
+// Which lists of moment/ are cut into segments, worked on side by side, by the image's size and the room for pairs.
+// ListSegment finds a segment in the chunk plan.
 #pragma once
 
 #include <algorithm>

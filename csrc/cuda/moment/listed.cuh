@@ -1,8 +1,7 @@
 // Kernels filter and listed_blend: the forward pass for lists that are cut into segments. A tile may have hundreds of
-// thousands of splats, most smaller than a pixel. So `filter` tests every pair against every pixel, and writes bits to
-// reach_words. `listed_blend` composites in a pixel only splats that reach it, from a queue (queue.cuh), or walks those
-// that reach any of a warp's few pixels. It writes what moving_blend does; segment_maps stores the checkpoints within
-// later segments.
+// thousands of splats, most smaller than a pixel. So `filter` writes to reach_words which pairs reach which pixels.
+// `listed_blend` composites in a pixel only these, from a queue (queue.cuh), or walks those that reach any of a warp's
+// few pixels. It writes what moving_blend does; segment_maps stores the checkpoints within later segments.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -195,8 +194,8 @@ template <class F, int C, int kSide> union WarpStage {
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
-/// A block has a pixel of one of the longest lists, which come first, or each warp a few pixels of another list. Writes
-/// the channels [first, first + C).
+/// A block has a pixel of a longest list, which come first, or each warp a few pixels of another. Writes the channels
+/// [first, first + C).
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // moving_blend_kernel need not wait for filter_kernel

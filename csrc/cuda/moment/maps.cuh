@@ -1,7 +1,7 @@
 // Kernels segment_maps and chain_maps: the first steps of the backward pass for lists that are cut. A segment is an
-// affine map of a sample's Adjoint. `segment_maps` writes those of all segments but the first to adjoint_maps, and the
-// checkpoints that blend did not store. `chain_maps` applies them, last segment first, and replaces them by what
-// segment_vjp begins with.
+// affine map of a sample's Adjoint. `segment_maps` writes the maps of all but the first to adjoint_maps, and
+// checkpoints that blend did not store. `chain_maps` applies them, last first, and replaces them by what segment_vjp
+// begins with.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// When moment/ cuts lists, length of segments, and launch shapes, chosen by measuring, with what they trade.
+// When moment/ cuts lists, length of segments, and launch shapes, as measured, with what they trade.
 #pragma once
 
 namespace ar::cuda {
@@ -14,8 +14,8 @@ struct MomentPolicy {
   /// Resident threads of moving_blend.
   static constexpr int blend_threads(int channels) { return channels == 3 ? 1024 : 0; }
 
-  /// In large images lists of so many pairs are cut, or of a block's share (kListBlocksPerSm) if more. A cut list is
-  /// more work, which blocks share.
+  /// In large images lists of so many pairs are cut, or of a block's share (kListBlocksPerSm) if more. Cutting adds
+  /// work, which blocks share.
   static constexpr int kLongList = 4096;
   static constexpr int kListBlocksPerSm = 4;
   /// Pairs of a segment. Longer segments need fewer maps, shorter ones fill a device with smaller scenes.

@@ -1,6 +1,6 @@
-// How listed_blend composites a pixel by a queue of the splats that reach it, by the bits of filter, without waiting
-// for those of its neighbours. Lanes that share a sample test several queued splats at once. For the longest lists all
-// warps of a block have one pixel.
+// listed_blend composites a pixel from a queue of the splats that reach it, by the bits of filter, without waiting for
+// those of neighbours. Lanes that share a sample test several queued splats at once. For the longest lists a block has
+// one pixel.
 #pragma once
 
 #include "cuda/moment/cells.cuh"
@@ -140,7 +140,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
-    // By all lanes, into registers: the compiler would wait to copy what only some read.
+    // By all lanes: the compiler would wait to copy what only some read.
     splat = load_splat<F>(splats_in, next_id);
     channels = channels_of<C>(channels_in, splat, next_id, first_channel);
     take_next(queues);
@@ -164,7 +164,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
 };
 
 /// Composites n staged splats of this lane's pixel, from first_staged on. The lanes of a sample test kAhead at once and
-/// composite the first that shows; then the node has moved, and they test the later ones again.
+/// composite the first that shows; as this moves the node, they test later ones again.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;

@@ -6,8 +6,8 @@
 
 namespace ar::cuda {
 
-/// What a kernel for the channels [first, first + C) sums besides these channels. PairGrad is linear in the gradient,
-/// so that each kernel adds its share. MeanSums need all channels: the first kernel makes them, and all of PairGrad.
+/// What a kernel for the channels [first, first + C) sums besides these channels. PairGrad is linear in the gradient:
+/// each kernel adds its share. MeanSums need all channels: the first kernel makes them, and all of PairGrad.
 template <int C> struct WantedSums {
   static constexpr bool kMany = C > kFewChannels;  ///< there may be several kernels
   bool shape;                                      ///< PairGrad

@@ -1,6 +1,5 @@
 // Kernel segment_vjp: the last step of the backward pass for lists that are cut. A block claims a segment and goes back
-// through it in batches, whose groups of pixels, unequal work, its warps claim. adjoint_maps keeps the Adjoints from
-// batch to batch.
+// through it in batches, whose groups, unequal work, its warps claim. adjoint_maps keeps Adjoints between batches.
 #pragma once
 
 #include <algorithm>
@@ -56,7 +55,7 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   Lane lane(params, list);
   lane.begin(params, first, wanted);
   const int (&last)[Layout::kCells] = lane.last.samples;
-  // Where a batch leaves the Adjoint for the next: in numbers of the segment's map, no longer needed.
+  // Where a batch leaves the Adjoint for the next: in the segment's map, no longer needed.
   constexpr int kCarried = 3;
   const auto map_of = [&](int i) {
     return MapMemory<F, Layout::kTilePixels>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());

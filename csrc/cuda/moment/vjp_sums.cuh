@@ -1,5 +1,5 @@
-// Sums over pixels: the gradient of a pair. Warps write sums to shared memory or to group_sums; VjpBatch::write adds
-// them up and writes rows of pair_grads and channel_sums.
+// Sums over pixels: the gradient of a pair. Warps write sums to shared memory or group_sums; VjpBatch::write adds them
+// up to rows of pair_grads and channel_sums.
 #pragma once
 
 #include "cuda/moment/vjp_grads.cuh"

@@ -1,6 +1,6 @@
 // Kernel moving_vjp: the backward pass for lists that are not cut. The state before a splat does not follow from that
 // after it: a warp composites each chunk of 32 splats again from the checkpoint before it, stores positions, and walks
-// back over the splats that its pixels show. segment_vjp shares batch_vjp and launch_vjp.
+// back over splats that its pixels show.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,4 @@
-// Kernel moving_blend: the forward pass for lists that are not cut. A block walks the whole list of a tile. It writes
-// images, and for a backward pass transmittance, `last` and checkpoints.
+// Kernel moving_blend: the forward pass for lists that are not cut. A block walks the whole list of a tile.
 #pragma once
 
 #include "cuda/launch.cuh"

@@ -1,5 +1,5 @@
-// Cameras and lenses from what users give, and adjoints (core/camera/prepare.h): small kernels, so that a frame neither
-// copies from the host nor waits for it. A block per direction and camera searches what limits a lens.
+// Cameras and lenses from what users give, and adjoints (core/camera/prepare.h), so that a frame neither copies from
+// the host nor waits for it. A block per direction and camera searches the limits of a lens.
 #include "cuda/project/cameras.h"
 
 #include "cuda/launch.cuh"

@@ -1,4 +1,4 @@
-// Launch shapes of the kernels of project/, chosen by measuring, with what they trade.
+// Launch shapes of project/, as measured, with what they trade.
 #pragma once
 
 namespace ar::cuda {

@@ -10,7 +10,7 @@
 
 namespace ar::cuda {
 
-/// Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients, else project_vjp.
+/// Gaussians of a warp. If none has pairs, zero_culled_grads writes their gradients.
 inline constexpr int kGradRows = 32;
 static_assert(ProjectPolicy::kThreads % kGradRows == 0 && ProjectPolicy::kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
@@ -173,7 +173,7 @@ struct StagedGrads : GaussianGrads<float> {
   __device__ StagedGrads(const GaussianGrads<float>& grads) : GaussianGrads<float>(grads) {}
 };
 
-/// A thread per Gaussian. From: FromPairs or FromRows. Out: GaussianGrads<float>, or StagedGrads with FromRows.
+/// From: FromPairs or FromRows. Out: GaussianGrads<float>, or StagedGrads with FromRows.
 template <class Cam, class From = FromPairs, class Out = GaussianGrads<float>>
 __global__ void __launch_bounds__(ProjectPolicy::kThreads,
                                   blocks_per_sm(Cam::kFull ? ProjectPolicy::kFullVjpBlocks : ProjectPolicy::kVjpBlocks,
@@ -311,8 +311,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) sum_few_channels_kern
   }
 }
 
-/// channel_sums: [rows, C]. A splat has kLanes lanes, or with many pairs the block. A lane has four
-/// channels.
+/// channel_sums: [rows, C]. A splat has kLanes lanes, or with many pairs the block; a lane four channels.
 template <int C>
 __global__ void __launch_bounds__(ProjectPolicy::kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();

@@ -1,5 +1,5 @@
-// Kernels of projection for the order along rays (core/order.h), apart from the others, which so stay as quick:
-// ray_depths after `project`, row_slopes after `project_rows`.
+// Kernels for the order along rays (core/order.h): ray_depths after `project`, row_slopes after `project_rows`. Apart,
+// so that both stay as quick.
 #pragma once
 
 #include "core/rows.h"

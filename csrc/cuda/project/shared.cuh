@@ -1,4 +1,4 @@
-// What the kernels of projection share: the camera and rows of harmonics in shared memory, and how they are launched.
+// For kernels of projection: the camera and harmonics in shared memory, and launches.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Launches blend_rays (blend.cuh): the forward pass in the order along rays.
+// Launches blend_rays (blend.cuh).
 #include "cuda/rays/blend.cuh"
 
 #include "cuda/dispatch.h"

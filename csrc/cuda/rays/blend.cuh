@@ -1,5 +1,5 @@
-// Kernel blend_rays: the forward pass in the order along rays, for up to four channels. A warp, its own block,
-// for each half of a tile.
+// Kernel blend_rays: the forward pass in the order along rays, for up to four channels. A block, one warp, per half
+// tile.
 #pragma once
 
 #include "cuda/rays/walk.cuh"

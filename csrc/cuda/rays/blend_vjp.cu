@@ -1,4 +1,4 @@
-// Launches blend_rays_vjp (vjp.cuh): the backward pass in the order along rays.
+// Launches blend_rays_vjp (vjp.cuh).
 #include <algorithm>
 
 #include "cuda/dispatch.h"

@@ -1,4 +1,4 @@
-// Launch shapes and lengths of loops in the kernels of rays/, with what they trade.
+// Launch shapes and lengths of loops of rays/, with what they trade.
 #pragma once
 
 #include <cstdint>
@@ -6,7 +6,7 @@
 namespace ar::cuda {
 
 struct RayPolicy {
-  /// Entries of a lane between two times that its window is sorted: lanes do so together, against shared memory.
+  /// Entries of a lane between two sorts, against shared memory.
   static constexpr int kPending = 8;
   /// Slots of a window that are read together: waiting, against reads in vain.
   static constexpr int kTogether = 4;
@@ -15,10 +15,10 @@ struct RayPolicy {
 
   /// Blocks, of a warp, on a multiprocessor, against registers. Some devices hold no more.
   static constexpr int kBlocks = 16;
-  /// Blocks of the backward pass for each multiprocessor, which share the tiles, against memory for RayLog.
+  /// Of the backward pass, whose blocks share the tiles, against memory for RayLog.
   static constexpr int kVjpBlocks = 18;
 
-  /// Most bytes of a RayLog, and most rows of a warp, a power of two: lists in which more is composited are walked
+  /// Most bytes of a RayLog, and most rows of a warp, a power of two. Lists in which more is composited are walked
   /// again.
   static constexpr int64_t kLogBytes = int64_t(384) << 20;
   static constexpr int kLogRows = 256;

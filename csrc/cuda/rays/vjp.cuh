@@ -1,11 +1,10 @@
 // Kernel blend_rays_vjp: the backward pass in the order along rays, for up to four channels. The order is taken as
-// given. A warp, its own block, composites half a tile again, each lane logging what it composited (RayLog), and then
-// walks back over the log. In each step the splat of the farthest event that is next in any lane is done by all lanes
-// in which it is next: mostly by all that see it, since neighbours see it at nearly the same depth. The tile has no
-// other warp, and a value of the sum is always added by the same lane, so that all sums have a fixed order; only tiles
-// of a patch change it.
+// given. A block is a warp. It composites half a tile again, each lane logging what it composited (RayLog), and walks
+// the log back. A step takes the splat of the farthest next event, in all lanes in which it is next: mostly in all that
+// see it, at nearly the same depth. One lane adds each value of a sum, and no other warp has the tile: sums have a
+// fixed order, but for tiles of a patch.
 //
-// The log keeps the last events of a lane. If one is lost, the warp composites the half again, each lane up to there.
+// The log keeps a lane's last events. If one is lost, the warp composites the half again, each lane up to there.
 #pragma once
 
 #include <limits>
@@ -32,13 +31,13 @@ struct RayEvent {
   float raw = 0;            ///< if kLogsRaw
 
   RayEvent() = default;
-  /// The bits of positive numbers have their order. Others only come in another one.
+  /// Bits of positive numbers have their order; others only come in another.
   __device__ RayEvent(float depth, SlotPair pair, float raw) : pair(pair), raw(raw) {
     distance = min(max(__float_as_int(depth), kNone + 1), kLost - 1);
   }
 };
 
-/// A lane's part of the log. Only the lane itself reads it.
+/// A lane's own part of the log.
 template <class F> class LaneLog {
  public:
   /// Where samples that move were, before the splat.
@@ -84,7 +83,7 @@ template <class F, int C> struct RayAdjoint {
   Values<C> gradient;  ///< of one sample's channels
   float transmittance[S], behind[S];
   Vec2<float> dL_dplace[F::kMoves ? S : 1];
-  int stopped[S];  ///< event of the lane from which on the sample composited nothing
+  int stopped[S];  ///< event from which on it composited nothing
 
   __device__ RayAdjoint(const BlendVjpParams& params, const Pixel& pixel) {
     using Samples = LaneSamples<S, 1>;
@@ -203,7 +202,7 @@ template <class F, int C> class RayWalkBack {
   const LaneLog<F>& log_;
 };
 
-/// Composites half of the tile, each lane up to event `end`. Returns the events that the lane has logged.
+/// Composites half of the tile, each lane up to event `end`. Returns the lane's events.
 template <class F, class Adjoint>
 __device__ int log_rays(const BlendVjpParams& params, const TileList& list, int half, RaySamples<F>& samples,
                         const LaneLog<F>& log, int end, Adjoint& adjoint) {
@@ -245,7 +244,7 @@ __device__ int log_rays(const BlendVjpParams& params, const TileList& list, int 
   return row;
 }
 
-/// C: as in blend_rays. Each block, a warp, claims tiles until none is left.
+/// C: as in blend_rays. Blocks claim tiles.
 template <class F, int C>
 __global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_vjp_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();

@@ -1,9 +1,8 @@
 // A warp walks the list of a tile in the order along rays (core/order.h) for the 8x4 pixels of half a tile, a lane per
-// pixel. RayStage has splats that may enter the windows, RayWindow is the window of a lane, RaySamples its samples.
-// Lists are not cut: the window of a pixel sees all of its splats in the list's order.
+// pixel. Lists are not cut: a window sees all of a list.
 //
-// Lanes show different splats, so each lane first writes down what enters its window. When a lane has no room left, all
-// lanes sort theirs in together, and composite together what leaves.
+// Lanes show different splats, so each first writes down what enters its window. When one has no room left, all lanes
+// sort, and composite what leaves.
 #pragma once
 
 #include "core/order.h"
@@ -38,11 +37,11 @@ struct alignas(8) RayEntry {
   int32_t payload = -1;
 };
 
-/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. Slot k of the
-/// lane is at 32 k, so that no two lanes meet in a bank.
+/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. Slot k is at 32
+/// k: no two lanes meet in a bank.
 class RayWindow {
  public:
-  /// So many before `memory` may be read.
+  /// Slots before `memory` that may be read.
   static constexpr int kTogether = RayPolicy::kTogether;
 
   __device__ RayWindow(RayEntry* memory, int window) : slots_(memory + lane_id()), window_(32 * window) {}
@@ -58,7 +57,7 @@ class RayWindow {
     slots_[end_] = entry;
     end_ += 32;
   }
-  /// What was appended enters the window, one after the other, behind equal depths.
+  /// What was appended enters the window, behind equal depths.
   __device__ void sort() {
     for (; sorted_ < end_; sorted_ += 32) {
       const RayEntry entry = slots_[sorted_];
@@ -80,7 +79,7 @@ class RayWindow {
   }
   /// After sort(): whether something has left. `all`: at the end of the list.
   __device__ bool leaves(bool all) const { return end_ - first_ > (all ? 0 : window_); }
-  /// Takes the nearest entries of those, up to kCount.
+  /// Takes the nearest of those, up to kCount.
   template <int kCount> __device__ void take(bool all, RayEntry (&entries)[kCount]) {
     AR_UNROLL for (int i = 0; i < kCount; ++i) {
       entries[i] = {};
@@ -107,7 +106,7 @@ class RayWindow {
   int first_ = 0, sorted_ = 0, end_ = 0;
 };
 
-/// Of a pixel, all in a lane.
+/// Of a pixel.
 template <class F> struct RaySamples {
   static constexpr int S = F::kSamples;
   float transmittance[S];                 ///< negative: the sample has stopped
@@ -162,10 +161,9 @@ __device__ Blended<float> blend_leaving(const LeavingSplat<F>& splat, const RayE
   }
 }
 
-/// Walks the list for a half of the tile. All lanes of the warp must call it; those with `open` false only load splats.
-/// payload_of(place, splat): what entries carry. leave(entries), called by the whole warp: composites them in order,
-/// and returns whether the lane has an open sample. `memory` is behind a RayStage. `open` is a bool, which takes
-/// longer.
+/// Walks the list for half of the tile. All lanes must call it; those not `open` (an int, as a bool takes longer) only
+/// load splats. payload_of(place, splat): what entries carry. leave(entries) composites them in order in the whole
+/// warp, and returns whether the lane has an open sample. `memory` is behind a RayStage.
 template <class F, class Params, class PayloadOf, class Leave>
 __device__ void walk_rays(const Params& params, const TileList& list, RayStage<F>& stage, RayEntry* memory, int half,
                           int open, PayloadOf&& payload_of, Leave&& leave) {
@@ -185,7 +183,7 @@ __device__ void walk_rays(const Params& params, const TileList& list, RayStage<F
   const Vec2<float> p = ray_pixel(half);
   // The same bits in tiles of all sizes.
   const Vec2<float> pixel = {float(list.x0) + p.x, float(list.y0) + p.y};
-  // The next batch is on its way while the warp walks this one.
+  // Loads a batch while the warp walks the one before.
   const auto splat_of = [&](int place) { return place < list.count ? list.splat(place) : -1; };
   Splat<F, float> splat = {};
   RayDepth<float> depth = {};

@@ -1,5 +1,4 @@
-// Launches blend_front and the tail (front.cuh, tail.cuh): the forward pass of footprints whose samples stay, for up to
-// four channels.
+// Launches blend_front (front.cuh) and the tail (tail.cuh).
 //
 // Tried and lost: docs/internals/log.md, "still/, forward" and "still/, backward".
 #include "cuda/dispatch.h"

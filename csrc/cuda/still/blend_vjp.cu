@@ -1,4 +1,4 @@
-// Launches blend_vjp (vjp.cuh): the backward pass of footprints whose samples stay, for up to four channels.
+// Launches blend_vjp (vjp.cuh).
 #include "cuda/dispatch.h"
 #include "cuda/still/vjp.cuh"
 

@@ -1,5 +1,4 @@
-// What blend_front and the tail share: addresses of a pixel's checkpoints, and writing a finished pixel and the
-// checkpoints where blend_vjp starts.
+// Addresses of a pixel's checkpoints; writes finished pixels, and the checkpoints where blend_vjp starts.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"

@@ -1,9 +1,9 @@
-// Length of the front and launch shapes of still/, chosen by measuring, with what they trade.
+// Length of the front and launch shapes of still/, as measured, with what they trade.
 #pragma once
 
 namespace ar::cuda {
 
-/// F: what a lane blends. Blocks: resident on a multiprocessor, for more latency hidden with fewer registers.
+/// F: what a lane blends. Blocks: resident on a multiprocessor, against registers.
 struct StillPolicy {
   /// Splats between votes on whether any sample is open.
   static constexpr int kBetweenVotes = 16;

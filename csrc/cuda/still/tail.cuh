@@ -1,6 +1,6 @@
-// Kernels that finish the tiles that blend_front has left open. tail_through finds how much light each chunk lets
-// through, tail_scan multiplies this up to the transmittance before each chunk, tail_blend composites each chunk from
-// there, and tail_sum adds the chunks up and writes images.
+// Kernels for tiles that blend_front leaves open. tail_through finds how much light each chunk lets through, tail_scan
+// multiplies this up to the transmittance before each chunk, tail_blend composites each from there, and tail_sum adds
+// them up and writes images.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -11,7 +11,7 @@
 
 namespace ar::cuda {
 
-/// visit(chunk, its list, its end in the list) for this block's tail chunks of open tiles.
+/// visit(chunk, its list, its end in the list) for the block's tail chunks of open tiles.
 template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -133,8 +133,7 @@ __global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(StillPolicy::kTai
 
 inline constexpr int kTailSumThreads = 32 * StillPolicy::kTailSumWarps;
 
-/// Adds chunks up, and writes pixels. Samples: LaneSamples of what a
-/// lane blends. C, kKeep: as in blend_front.
+/// Adds chunks up, and writes pixels. Samples: LaneSamples. C, kKeep: as in blend_front.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();

@@ -1,6 +1,6 @@
-// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. A warp goes through a
-// chunk of a tile's list back to front with all pixels of the tile, eight per lane. So one warp makes the sums of a
-// pair, without atomics, whose order varies; only tiles of a patch use them.
+// Kernel blend_vjp: the backward pass of footprints whose samples stay, for up to four channels. A warp goes back
+// through a chunk with all pixels of the tile, eight per lane: it makes the sums of a pair without atomics, whose order
+// varies, but for tiles of a patch.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -16,7 +16,7 @@ template <class F, int C> struct VjpShared {
   VjpBatch<F, C> batches[StillPolicy::kVjpWarps<F>];
 };
 
-/// Parameters as of blend_front_kernel. kMeans: with MeanSums. Each warp claims chunks until none is left.
+/// Parameters as of blend_front_kernel. kMeans: with MeanSums. Warps claim chunks.
 template <class F, int C, bool kMeans>
 __global__ void __launch_bounds__(32 * StillPolicy::kVjpWarps<F>,
                                   blocks_per_sm(StillPolicy::kVjpBlocks<F, C>, 32 * StillPolicy::kVjpWarps<F>))

@@ -1,4 +1,4 @@
-// The pixels of a tile in a warp of blend_vjp, one of each subtile per lane, in registers or shared memory.
+// A tile's pixels in a warp of blend_vjp, one of each subtile per lane, in registers or shared memory.
 #pragma once
 
 #include "cuda/tile/pixels.cuh"

@@ -1,4 +1,4 @@
-// Splats that a warp of blend_vjp has listed, and PairSums, which adds the sums of eight pairs over lanes.
+// A warp's list of splats in blend_vjp, and PairSums, which adds eight pairs over lanes.
 #pragma once
 
 #include "cuda/still/vjp_pixels.cuh"

@@ -1,4 +1,4 @@
-// How a warp of blend_vjp takes the pixels of a tile back to front through a chunk, and writes rows of pair_grads.
+// A warp of blend_vjp takes a tile's pixels back through a chunk, and writes rows of pair_grads.
 #pragma once
 
 #include "cuda/still/vjp_sums.cuh"
@@ -211,7 +211,7 @@ template <class F, int C, bool kMeans> class ChunkWalk {
     }
   }
 
-  /// Sums over lanes into the row of the pair, or stores values at `to` for sum_pairs().
+  /// Sums over lanes into the pair's row, or stores values at `to` for sum_pairs().
   template <class To>
   __device__ __forceinline__ void put_grads(int32_t row, ShapeGrad<float> shape, float weighted,
                                             const Values<C>& channels, To& to) {

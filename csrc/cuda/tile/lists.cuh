@@ -1,5 +1,4 @@
-// The list of a tile: which pairs it has, where they lie in TileLists, and the rows of pair_grads that a backward pass
-// writes for them. Where there is too little room for pairs, the tiles of a patch share one list (params.h).
+// The list of a tile: its pairs in TileLists, and their rows of pair_grads. The tiles of a patch share one (params.h).
 #pragma once
 
 #include "cuda/params.h"

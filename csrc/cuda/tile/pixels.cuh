@@ -1,4 +1,4 @@
-// The pixels of a tile: which lane has which pixel or sample, what it keeps between splats, and where it writes.
+// Which lane has which pixel or sample of a tile, what it keeps between splats, and where it writes.
 //
 // A tile of 16x16 pixels has eight subtiles of 8x4 pixels. Forward a warp has one, in still/vjp.cuh all. Subtile b is
 // in column b % 2 and row b / 2 of the tile, and the pixel of lane l in column l % 8 and row l / 8 of the subtile. With

@@ -1,11 +1,11 @@
-// Splats of a tile that a block loads into shared memory together, with their channels.
+// Splats that a block loads into shared memory, with their channels.
 #pragma once
 
 #include "cuda/tile/reach.cuh"
 
 namespace ar::cuda {
 
-/// All kernels of blending read splats [n, kSplatWidth] here.
+/// splats: [n, kSplatWidth].
 template <class F> __device__ Splat<F, float> load_splat(const float* splats, int32_t id) {
   return reinterpret_cast<const Splat<F, float>*>(splats)[id];
 }

@@ -1,5 +1,5 @@
-// What a training does to each Gaussian by itself: core/activations.h and core/density.h, a thread per Gaussian.
-// `sum_penalty` adds up what the blocks of `activate` have of the penalty.
+// core/activations.h and core/density.h, a thread per Gaussian. `sum_penalty` adds up what blocks of `activate` have of
+// the penalty.
 #include "core/activations.h"
 #include "core/density.h"
 
@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kThreads = 256, kWarps = kThreads / 32;
 
-// T: float or double. Arrays have a row for each of p.n Gaussians.
+// Arrays have a row for each of p.n Gaussians.
 /// block_sums: [blocks]; null: no penalty is wanted.
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p, T* block_sums) {
   wait_for_earlier_kernels();

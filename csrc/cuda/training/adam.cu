@@ -1,5 +1,4 @@
-// A step of Adam on several tensors at once: one kernel updates parameters and moments; a block has a part of one
-// tensor.
+// A step of Adam on several tensors in one kernel; a block has a part of one tensor.
 #include "core/adam.h"
 
 #include "cuda/launch.cuh"
@@ -11,7 +10,7 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kBytes = 16;  ///< of each array that a thread loads at once
 
-/// Numbers that a thread loads at once. T: float or double, in this file.
+/// Numbers that a thread loads at once.
 template <typename T> struct alignas(kBytes) Packed {
   static constexpr int kWidth = kBytes / sizeof(T);
   T values[kWidth];

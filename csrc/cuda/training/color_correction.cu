@@ -1,5 +1,5 @@
-// The correction of a picture's colours and its adjoint. `correct_vjp` writes sums of blocks for the gradient of the
-// matrix, `sum_blocks` adds these up in a fixed order.
+// The correction of a picture's colours and its adjoint. `sum_blocks` adds up, in a fixed order, what blocks of
+// `correct_vjp` have of the matrix's gradient.
 #include "core/color_correction.h"
 
 #include "cuda/launch.cuh"
@@ -20,7 +20,6 @@ template <class Body> __device__ void for_each_pixel(int64_t pixels, const Body&
 
 template <bool kVignetted> constexpr int kSums = kCorrection + (kVignetted ? kVignetting : 0);
 
-// T: float or double, in this file.
 template <bool kVignetted, typename T>
 __global__ void __launch_bounds__(kThreads) correct_kernel(const CorrectParams<T> p) {
   wait_for_earlier_kernels();

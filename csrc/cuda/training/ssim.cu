@@ -1,6 +1,6 @@
-// The similarity of two images, a loss made of it and l1, and the adjoint. `ssim` writes similarities, partial
-// derivatives and sums of blocks, `loss` adds these sums up in a fixed order, and `ssim_vjp` makes the gradient of the
-// image from the partial derivatives.
+// The similarity of two images, a loss of it and l1, and the adjoint. `ssim` writes similarities, partial derivatives
+// and sums of blocks, `loss` adds these up in a fixed order, and `ssim_vjp` makes the image's gradient from the partial
+// derivatives.
 //
 // Sums go along rows, then columns, in shared memory. A thread makes kRun neighbouring sums from registers, to load
 // less.
@@ -16,14 +16,14 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kReach = 2 * kSsimRadius;
 
-/// The tile of a block. T: float or double, in this file.
+/// The tile of a block.
 template <typename T> struct Tile {
   static constexpr int kColumns = 32;
   static constexpr int kRun =
       sizeof(T) == 4 ? 4 : 1;  ///< pixels of a thread, in a column: loads from shared memory against registers
   static constexpr int kRows = kThreads / kColumns * kRun;
   static constexpr int kReadColumns = kColumns + kReach, kReadRows = kRows + kReach;
-  // The remainder by four is three: threads with runs of four in neighbouring rows read from different banks.
+  // The remainder by four is three: runs of four in neighbouring rows read from different banks.
   static constexpr int kReadPitch = kReadColumns + 1;
   static constexpr int kSumPitch = kColumns + 1;
 };

@@ -1,5 +1,5 @@
-// The kernels of a training step besides rendering. Pointers are device memory. Nothing waits for the device. Bits do
-// not depend on the order of blocks. T: float or double.
+// The kernels of a training step besides rendering. Pointers are device memory. Nothing waits for the device. The order
+// of blocks changes no bit. T: float or double.
 #pragma once
 
 #include <cuda_runtime_api.h>
