@@ -210,11 +210,11 @@ class Renderer:
         view = np.array(camera.w2c).reshape(4, 4)
         clamp = self.shaders["frustum_clamp"] / 2
         values = {
-            "uView": [tuple(row) for row in view[:3]],
-            "uEye": tuple(-view[:3, :3].T @ view[:3, 3]),
-            "uPinhole": (camera.fx, camera.fy, camera.cx, camera.cy),
-            "uLimit": (clamp * camera.width / camera.fx, clamp * camera.height / camera.fy),
-            "uVariance": footprint["variance"],
+            "frame.view": [tuple(row) for row in view[:3]],
+            "frame.eye": tuple(-view[:3, :3].T @ view[:3, 3]),
+            "frame.pinhole": (camera.fx, camera.fy, camera.cx, camera.cy),
+            "frame.limit": (clamp * camera.width / camera.fx, clamp * camera.height / camera.fy),
+            "frame.variance": footprint["variance"],
         }
         values = {name: value for name, value in values.items() if name in program}
         self.set_uniforms(program, {"uGeometry": self.geometry, "uHarmonics": self.harmonics}, **values)

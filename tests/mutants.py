@@ -122,8 +122,8 @@ MUTANTS = (
     Mutant(
         "render",
         "analytic_rasterizer/render/sphere.py",
-        "means3D.new_tensor([size[1] / 2, size[0] / 2])",
-        "means3D.new_tensor([size[0] / 2, size[1] / 2])",
+        "splats.means2d.new_tensor([size[1] / 2, size[0] / 2])",
+        "splats.means2d.new_tensor([size[0] / 2, size[1] / 2])",
         ("test_lens.py", "means2d"),
     ),
     Mutant(
