@@ -1,18 +1,16 @@
 """Pictures of docs/gallery.md: test photographs of a capture beside renderings of a scene that was trained on it.
 
-    python benchmarks/gallery.py TRAINING --name maryrose --views IMG_9693 IMG_9725
+    python benchmarks/gallery.py TRAINING --name maryrose --views IMG_9685 IMG_9733
 
 TRAINING is the folder that `train` wrote. Each photograph and each rendering is a file, at each of `--scales`; coarse
 ones have their pixels enlarged, so that all have one size. What masks leave out is white in both, and what is
-transparent too. `--cut FILE` writes the scene without Gaussians that masks leave out, to go on from. It prints the PSNR
-of each pair, dB, over what counts.
+transparent too. It prints the PSNR of each pair, dB, over what counts.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -21,22 +19,17 @@ from torch import Tensor
 from analytic_rasterizer import io
 from analytic_rasterizer.distributed.ranks import ALONE
 from analytic_rasterizer.training import CaptureSource, Pictures, load_pictures
-from analytic_rasterizer.training.captures import Photograph
 from analytic_rasterizer.training.evaluation import psnr, rendered
-from analytic_rasterizer.training.photographs import counted_pixels
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images" / "gallery"
 SCALES = (1, 4, 8)
 QUALITY = 86  # of WebP at the full size; enlarged pixels are lossless
 WHITE = 1.0
-SHOWN = 0.5  # share of the photographs that show a point of an object
-COUNTED = 0.9  # share of the photographs that show a Gaussian and count it, at least
 
 
-def capture_of(training: Path, data: str | None):
+def capture_of(training: Path):
     """The capture of a training, read as it was."""
-    source = CaptureSource.from_dict(json.loads((training / "options.json").read_text())["source"])
-    return (source if data is None else replace(source, folder=data)).settled().load()
+    return CaptureSource.from_dict(json.loads((training / "options.json").read_text())["source"]).settled().load()
 
 
 def on_white(image: Tensor, mask: Tensor | None) -> Tensor:
@@ -67,40 +60,19 @@ def draw(scene, pictures: Pictures, footprint: str, out: Path, name: str) -> lis
     return measured
 
 
-def counted(items: list[Photograph], points: Tensor) -> Tensor:
-    """(P,) bool: points (P, 3) that SHOWN of the photographs show, at least, and nearly all of these count."""
-    shown, kept = points.new_zeros(len(points)), points.new_zeros(len(points))
-    for item in items:
-        mask, view = counted_pixels(item.files[1], item.mask), item.view
-        mask = torch.ones(view.height, view.width, dtype=torch.bool) if mask is None else mask
-        w2c = view.w2c.double()
-        inside = view.pixels_of(points.double() @ w2c[:3, :3].T + w2c[:3, 3])
-        column, row = (inside * inside.new_tensor([mask.shape[1] / view.width, mask.shape[0] / view.height])).unbind(1)
-        seen = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
-        shown += seen
-        kept[seen] += mask[row[seen].long(), column[seen].long()].to(kept.dtype)
-    return (shown >= SHOWN * len(items)) & (kept >= COUNTED * shown)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("training", type=Path, help="folder that `train` wrote")
-    add("--data", metavar="FOLDER", help="the capture (default: where the training had it)")
     add("--name", required=True, help="of the files")
     add("--views", nargs="*", default=[], metavar="NAME", help="test photographs (default: all)")
     add("--scales", nargs="+", type=int, default=SCALES, metavar="N")
     add("--footprint", metavar="NAME[:k=v]", help="(default: that of the training)")
-    add("--cut", type=Path, metavar="FILE", help="write the scene without what masks leave out")
     add("--out", type=Path, default=IMAGES, metavar="DIR")
     args = parser.parse_args()
     found = io.find_scene(args.training)
-    capture, scene = capture_of(args.training, args.data), io.load_scene(found.path)
+    capture, scene = capture_of(args.training), io.load_scene(found.path)
     footprint = str(found.choose_footprint(args.footprint).footprint)
-    if args.cut is not None:
-        scene = scene.rows(counted([*capture.train, *capture.test], scene.means))
-        io.save_scene(args.cut, scene, found.metadata)
-        print(f"{args.cut}: {scene.count} Gaussians")
     chosen = [item for item in capture.test if not args.views or Path(item.view.name).stem in args.views]
     args.out.mkdir(parents=True, exist_ok=True)
     pictures = load_pictures(chosen, tuple(args.scales), (WHITE,) * 3, "cpu")

@@ -68,8 +68,13 @@ def film(rows: list[list[torch.Tensor]], zoom: int) -> list:
     return [frame(list(pictures), box, zoom) for pictures in zip(*rows)]
 
 
-def save(frames: list, out: Path) -> None:
-    palette = frames[0].quantize(COLORS)
+def save(frames: list, out: Path, colors: int = COLORS) -> None:
+    """An animated PNG with one palette for all frames."""
+    width, height = frames[0].size
+    every = io.optional_import("PIL.Image").new("RGB", (width, height * len(frames)))
+    for k, picture in enumerate(frames):
+        every.paste(picture, (0, k * height))
+    palette = every.quantize(colors)
     first, *rest = [picture.quantize(palette=palette, dither=0) for picture in frames]
     options = {"save_all": True, "append_images": rest, "duration": MILLISECONDS, "loop": 0, "optimize": True}
     io.write_safely(out, lambda temporary: first.save(temporary, **options))

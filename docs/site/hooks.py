@@ -22,7 +22,7 @@ LINK = re.compile(r"`[^`]+`|(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\(
 
 # By class: figures on white, which a dark page shows inverted; figures whose labels a phone can read, side by side
 # where there is room.
-PHONE = ("moving", "conventions", "accuracy_time", "errors_weight", "footprints_one", "footprints_two", r"gallery/\w+")
+PHONE = ("moving", "popping", "conventions", "accuracy_time", "errors_weight", r"footprints_\w+", r"gallery/\w+")
 FIGURES = {"plot": ("growth",), "small": PHONE}
 # A photograph and its rendering in one paragraph become one picture with a divider between them.
 PAIR = re.compile(r"<p>(<img[^>]*_photograph\.[^>]*>)\s*(<img[^>]*_rendering\.[^>]*>)</p>")
