@@ -68,7 +68,7 @@ def film(rows: list[list[torch.Tensor]], zoom: int) -> list:
     return [frame(list(pictures), box, zoom) for pictures in zip(*rows)]
 
 
-def save(frames: list, out: Path, colors: int = COLORS) -> None:
+def write_film(frames: list, out: Path, colors: int = COLORS) -> None:
     """An animated PNG with one palette for all frames."""
     width, height = frames[0].size
     every = io.optional_import("PIL.Image").new("RGB", (width, height * len(frames)))
@@ -98,7 +98,7 @@ def main() -> None:
         rows.append(drawn(io.load_scene(args.folder / f"fruit_fly_{name}.ply"), truth.views, footprint))
         errors = [fruit_fly.psnr(*pair) for pair in zip(rows[-1], rows[0])]
         print(f"{name}: {sum(errors) / len(errors):.1f} dB")
-    save(film(rows, args.zoom), args.out)
+    write_film(film(rows, args.zoom), args.out)
 
 
 if __name__ == "__main__":

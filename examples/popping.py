@@ -105,7 +105,7 @@ def main() -> None:
     for order, title in ORDERS.items():
         pictures = rendered(poses, args.size, order)
         columns.append([(title, *pair) for pair in zip(pictures, changes(pictures))])
-    moving_fly.save([frame(list(column)) for column in zip(*columns)], args.out, COLORS)
+    moving_fly.write_film([frame(list(column)) for column in zip(*columns)], args.out, COLORS)
 
 
 if __name__ == "__main__":

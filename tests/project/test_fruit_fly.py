@@ -45,7 +45,7 @@ def test_film(tmp_path):
             picture[:, 5 + i : 9 + i, 6:12] = color
             rows[-1].append(picture)
     assert moving_fly.covered(rows[0]) == (5, 4, 13, 13)  # what any frame covers, and a pixel around it
-    moving_fly.save(moving_fly.film(rows, zoom=3), tmp_path / "moving.png")
+    moving_fly.write_film(moving_fly.film(rows, zoom=3), tmp_path / "moving.png")
     with io.optional_import("PIL.Image").open(tmp_path / "moving.png") as moving:
         assert moving.n_frames == 4 and moving.size == (2 * 3 * 8 + moving_fly.GAP, moving_fly.LABEL + 3 * 9)
         moving.seek(3)  # the square is where the last frame has it
