@@ -39,9 +39,8 @@ LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
 EXPOSURE = {True: (0.15, 0.15), False: (0.15, 0.3)}  # stops
 WHITE_BALANCE = {True: (5.0, 5.0), False: (5.0, 15.0)}  # percent
 VIGNETTING = 0.15  # stops: bonsai has 0.53, mouse 0.37; fox has 0.1, brighter to the left
-FAR = (
-    0.5  # halves of the diagonal, to which vignetting must be measured: mouse has 0.38, and a correction brings nothing
-)
+# Halves of the diagonal to which vignetting must be measured. mouse has 0.38, and a correction brings nothing.
+FAR = 0.5
 MIDDLE = 0.1  # of photographs that a spread leaves out: some see few points
 # Stops from the middle, from which on one photograph is odd: those of even and uneven captures have up to 0.65 (mouse),
 # and in the balance of colours 0.32 (fox).
