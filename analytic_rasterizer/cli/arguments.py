@@ -198,7 +198,7 @@ def add_scene(parser) -> None:
 
 def add_scene_file(parser) -> None:
     """SCENE."""
-    formats = ".ply, compressed .ply, .spz, .sog, its meta.json, .splat, .glb, .gltf"
+    formats = ".ply, compressed .ply, .spz, .sog, its meta.json, .splat, .glb, .gltf, .usd"
     scene = f"file of a scene ({formats}), or a folder: of `train`, or a model of 3DGS"
     parser.add_argument("scene", metavar="SCENE", help=scene)
 
