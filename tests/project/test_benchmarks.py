@@ -446,6 +446,34 @@ def test_training(device, tmp_path, run):
     assert run.err == f"error: {tmp_path}: there are no test pictures\n"
 
 
+def test_few_photographs(tmp_path, run):
+    """A row for every number of photographs and every kind of depths; points that fewer than two show are left out."""
+    pytest.importorskip("PIL.Image", reason="needs the train extra")
+    pytest.importorskip("scipy", reason="needs the train extra")
+    wall.write_wall(tmp_path / "wall")
+    options = ["--device", "cpu", "--iterations", "10", "--max-gaussians", "1000", "--json", tmp_path / "out.json"]
+    numbers = ["--photographs", "3", "5", "--depth", "none", "points", "maps"]
+    run("few_photographs", tmp_path / "wall", *options, *numbers, code=0)
+    runs = written(tmp_path)["runs"]
+    assert list(runs) == [f"{count}, {depth}" for count in (3, 5) for depth in ("none", "points", "maps")]
+    assert all(math.isfinite(row["psnr"]) and row["gaussians"] > 0 for row in runs.values())
+    assert len({row["psnr"] for row in runs.values()}) == 6
+
+    program = importlib.import_module("few_photographs")
+    capture = training.load_capture(tmp_path / "wall")
+    positions, colors = capture.points
+    behind = -torch.linalg.inv(capture.train[0].view.w2c)[:3, 2].float() + positions[:1]  # no photograph shows it
+    capture = capture._replace(points=(torch.cat([positions, 100 * behind]), torch.cat([colors, colors[:1]])))
+    few = program.with_few(capture, 3)
+    assert [capture.train.index(item) for item in few.train] == [1, 4, 6]
+    shown = sum(program.shown_points(item.view, capture.points[0]).long() for item in few.train)
+    assert torch.equal(few.points[0], capture.points[0][shown >= 2]) and 0 < len(few.points[0]) < len(shown)
+
+    write_nerf_synthetic(tmp_path / "balls", circle(2, (16, 16)), circle(2, (16, 16)))
+    run("few_photographs", tmp_path / "balls", *options, code=2)
+    assert run.err == f"error: {tmp_path / 'balls'}: --depth points needs a capture with points\n"
+
+
 def test_gsplat_training(tmp_path, monkeypatch, run):
     """Its strategy grows Gaussians from our call, and the error of the pictures falls; what is missing is said."""
     arguments = [tmp_path, "--device", "cpu", "--random-points", "300", "--json", tmp_path / "out.json"]
