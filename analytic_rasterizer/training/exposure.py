@@ -56,7 +56,7 @@ class Exposures:
         """Takes a step with gradients (3, 4) of some photographs, when `share` of the training is over."""
         if share < BEGIN:
             return
-        rate = RATE * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
+        rate = rate_at(share)
         for view, gradient in gradients.items():
             matrix, moments = self.matrices[view], [moment[view] for moment in self.moments]
             before = matrix.clone()
@@ -73,6 +73,11 @@ class Exposures:
         for own, moment in zip(self.moments, state["moments"]):
             own.copy_(moment)
         self.steps = state["steps"]
+
+
+def rate_at(share: float) -> float:
+    """The learning rate of corrections, when `share` of the training is over, BEGIN or more."""
+    return RATE * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
 
 
 def corrected(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .. import io, ops  # noqa: F401  (registers the fake kernels)
 from ..cameras.lens import SPHERE
-from .exposure import BEGIN, BETAS, EPS, GAMMA, RATE, RATE_END
+from .exposure import BEGIN, BETAS, EPS, GAMMA, rate_at
 from .vignetting import ONE_LENS, POWERS, cameras_of
 
 SAMPLES = 64  # of the squares of radii to which a polynomial is fitted
@@ -79,8 +79,8 @@ class Falloffs:
         for place, gradient in gradients.items():
             summed[self.camera[place]] += gradient
         self.steps += 1
-        rate = RATE * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
-        _adam([self.coefficients], [summed], *([m] for m in self.moments), [rate], [self.steps], *BETAS, EPS)
+        moments = ([moment] for moment in self.moments)
+        _adam([self.coefficients], [summed], *moments, [rate_at(share)], [self.steps], *BETAS, EPS)
 
     def state_dict(self) -> dict[str, Any]:
         return {"coefficients": self.coefficients, "moments": self.moments, "steps": self.steps}

@@ -12,6 +12,7 @@
 
 #include "core/bin.h"
 #include "core/covariance_vjp.h"
+#include "core/rows.h"
 
 namespace ar {
 
@@ -67,6 +68,11 @@ AR_HD Vec2<T> ray_slope(const Cam& camera, const Gaussians<T>& g, int64_t i, Vec
   return ray_slope(cov, dot(z, x), dot(z, y), [&](bool wide_x, T ratio) AR_HD_LAMBDA {
     return wide_x ? dot(z, y - ratio * x) : dot(z, x - ratio * y);
   });
+}
+
+template <class Cam, typename T>
+AR_HD Vec2<T> ray_slope(const Cam& camera, const Gaussians<T>& g, int64_t i, Vec3<T> view, DepthKind order) {
+  return ray_slope(camera, g, i, view, depth_by_vjp(order, camera, view, T(1)));
 }
 
 /// A splat in the window of a pixel, by its place in the tile's list; -1: none. Footprints whose samples stay keep

@@ -38,8 +38,7 @@ template <template <typename> class Cam, typename T> void count_candidates(const
 /// Of RayDepth. One copy, because few calls want it.
 template <class Cam, typename T>
 AR_ONE_COPY Vec2<T> slope_of(const Cam& camera, const Gaussians<T>& g, int64_t i, DepthKind order) {
-  const Vec3<T> view = project_mean(camera, g.means[i]).view;
-  return ray_slope(camera, g, i, view, depth_by_vjp(order, camera, view, T(1)));
+  return ray_slope(camera, g, i, project_mean(camera, g.means[i]).view, order);
 }
 
 template <template <typename> class Cam, typename T> void project(const cpu::ProjectParams<T>& p) {

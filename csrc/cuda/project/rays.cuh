@@ -2,17 +2,10 @@
 // so that both stay as quick.
 #pragma once
 
-#include "core/rows.h"
+#include "core/order.h"
 #include "cuda/project/project.cuh"
 
 namespace ar::cuda {
-
-/// As in cpu/project.h.
-template <class Cam>
-__device__ Vec2<float> slope_of(const Cam& camera, const Gaussians<float>& g, int64_t i, Vec3<float> view,
-                                DepthKind order) {
-  return ray_slope(camera, g, i, view, depth_by_vjp(order, camera, view, 1.0f));
-}
 
 template <class Cam>
 __global__ void __launch_bounds__(ProjectPolicy::kThreads) ray_depths_kernel(const RayDepthsParams params) {
@@ -22,7 +15,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) ray_depths_kernel(con
   const int64_t i = int64_t(blockIdx.x) * ProjectPolicy::kThreads + threadIdx.x;
   if (i >= params.gaussians.n || params.ranges[i].count == 0) return;
   const Vec3<float> view = project_mean(camera, params.gaussians.means[i]).view;
-  params.depths[i] = {depth_at(camera, view), slope_of(camera, params.gaussians, i, view, DepthKind::kOfModel)};
+  params.depths[i] = {depth_at(camera, view), ray_slope(camera, params.gaussians, i, view, DepthKind::kOfModel)};
 }
 
 /// Where there is no row the slope is zero already.
@@ -36,7 +29,7 @@ __global__ void __launch_bounds__(ProjectPolicy::kThreads) row_slopes_kernel(con
   const int64_t row = i < params.gaussians.n ? to.places.of(i) : -1;
   if (row < 0 || to.radii[to.conics ? 2 * row : row] <= 0) return;
   const Vec3<float> view = project_mean(camera, params.gaussians.means[i]).view;
-  to.slopes[row] = slope_of(camera, params.gaussians, i, view, params.rules.order);
+  to.slopes[row] = ray_slope(camera, params.gaussians, i, view, params.rules.order);
 }
 
 }  // namespace ar::cuda
