@@ -21,9 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from captures import add_capture
+from captures import add_capture, train_to_end
 from common import has_cuda
-from tqdm import tqdm
 
 import analytic_rasterizer as ar
 from analytic_rasterizer.analysis.tables import format_table
@@ -34,10 +33,8 @@ from analytic_rasterizer.training.depth_files import DepthFile
 from analytic_rasterizer.training.depth_targets import depths_of
 from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
 from analytic_rasterizer.training.files import write_json
-from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.start import background_of, begin
 
-LOOK_PERIOD = 100  # steps between looks at the losses
 DEPTHS = ("none", "points", "maps")
 
 
@@ -139,16 +136,7 @@ def train(args, capture: Capture, depth: str) -> tuple[Trainer, float]:
     )
     targets = depths.targets(pictures, torch.device(args.device))
     trainer = Trainer(options, start, pictures, background, args.device, depths=targets)
-    trainer.warm_up()
-    clock = Clock(trainer.device)
-    clock.start()
-    for step in tqdm(range(1, options.iterations + 1), disable=None):
-        trainer.step()
-        if step % LOOK_PERIOD == 0 or step == options.iterations:
-            trainer.take_losses()
-            trainer.progress.measure(clock.read())
-    clock.stop()
-    return trainer, clock.read()
+    return trainer, train_to_end(trainer)[0]
 
 
 def results_of(args, capture: Capture, trainer: Trainer, seconds: float) -> dict[str, float | int]:

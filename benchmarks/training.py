@@ -28,9 +28,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from captures import add_capture, load_train_and_test
+from captures import add_capture, load_train_and_test, train_to_end
 from common import has_cuda, peaks_of_memory, start_peaks
-from tqdm import tqdm
 
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
@@ -38,10 +37,8 @@ from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, loa
 from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.options import PRESETS, preset_values
 from analytic_rasterizer.training.parts import DOWNSAMPLINGS
-from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.start import background_of, starting_gaussians
 
-LOOK_PERIOD = 100  # steps between looks at loss and clock
 RATES_OF_3DGS = {name: value for name, value in PRESETS["3dgs"].values.items() if name.endswith("_rate")}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -135,18 +132,7 @@ def train_once(options: TrainingOptions, seed: int, capture, train, test, args) 
     background = background_of(options, capture.background)
     start_peaks(args.device)
     trainer = Trainer(options, starting_gaussians(options, capture.points), train, background, args.device)
-    trainer.warm_up()
-    clock, history = Clock(trainer.device), []
-    clock.start()
-    with tqdm(total=options.iterations if options.seconds == 0 else None, unit="step", disable=None) as bar:
-        while trainer.progress.share < 1:
-            trainer.step()
-            if trainer.progress.step % LOOK_PERIOD == 0 or trainer.progress.step == 10 or trainer.progress.share >= 1:
-                losses, seconds, count = trainer.take_losses(), clock.read(), len(trainer.gaussians.means)
-                history.append([trainer.progress.step, seconds, statistics.mean(losses), count])
-                trainer.progress.measure(seconds)
-                bar.update(trainer.progress.step - bar.n)
-    clock.stop()
+    seconds, history = train_to_end(trainer)
     paces = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(history)] or [history[0][1] / history[0][0]]
     results = evaluate(trainer.scene(), test, options.footprint, supersampling=options.supersampling)
     for values in results.values():
@@ -154,7 +140,7 @@ def train_once(options: TrainingOptions, seed: int, capture, train, test, args) 
     return {
         "options": options.to_dict(),
         "steps": trainer.progress.step,
-        "seconds": clock.read(),
+        "seconds": seconds,
         "ms_per_step": 1e3 * statistics.median(paces),
         "gaussians": len(trainer.gaussians.means),
         **peaks_of_memory(args.device),
