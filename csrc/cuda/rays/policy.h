@@ -13,6 +13,9 @@ struct RayPolicy {
   /// Entries of a lane whose splats are loaded together: waiting, against registers.
   template <class F> static constexpr int kAtOnce = F::kSamples > 1 ? 1 : 2;
 
+  /// Whether lanes that are alone with their splat add its sums themselves: fewer instructions, more requests.
+  static constexpr bool kAddsAlone = true;
+
   /// Blocks, of a warp, on a multiprocessor, against registers. Some devices hold no more.
   static constexpr int kBlocks = 16;
   /// Of the backward pass, whose blocks share the tiles, against memory for RayLog.

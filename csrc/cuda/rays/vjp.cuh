@@ -1,10 +1,9 @@
 // Kernel blend_rays_vjp: the backward pass in the order along rays, for up to four channels. The order is taken as
 // given. A block is a warp. It composites half a tile again, each lane logging what it composited (RayLog), and walks
-// the log back. A step takes the splat of the farthest next event, in all lanes in which it is next: mostly in all that
-// see it, at nearly the same depth. One lane adds each value of a sum, and no other warp has the tile: sums have a
-// fixed order, but for tiles of a patch.
+// the log back, row by row. Lanes are at different splats: in a row, lanes with the same splat are added up, lane after
+// lane. No other warp has the tile, and __syncwarp() is between rows: sums have a fixed order, but for tiles of a patch.
 //
-// The log keeps a lane's last events. If one is lost, the warp composites the half again, each lane up to there.
+// The log keeps the last rows. If there were more, the warp composites the half again, up to the first row kept.
 #pragma once
 
 #include <limits>
@@ -16,25 +15,64 @@ namespace ar::cuda {
 /// Whether the log keeps the opacity * weight of the one sample. Otherwise it is evaluated again.
 template <class F> inline constexpr bool kLogsRaw = !F::kMoves && F::kSamples == 1;
 
-/// RayEvent, and where samples were that move, or opacity * weight.
-template <class F> inline constexpr int kLogWords = 3 + (F::kMoves ? 2 * F::kSamples : kLogsRaw<F> ? 1 : 0);
+/// RayEvent, and where samples were that move.
+template <class F> inline constexpr int kLogWords = 2 + (F::kMoves ? 2 * F::kSamples : kLogsRaw<F> ? 1 : 0);
 
 /// Values of PairGrad and C channels.
 template <int C> inline constexpr int kRaySums = kPairChannels + C;
 
+/// Adds to four numbers, which are aligned.
+__device__ inline void add_four(float* to, const float* values) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && CUDART_VERSION >= 12010
+  asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(to), "f"(values[0]), "f"(values[1]),
+               "f"(values[2]), "f"(values[3])
+               : "memory");
+#else
+  AR_UNROLL for (int v = 0; v < 4; ++v) atomicAdd(to + v, values[v]);
+#endif
+}
+
+/// Adds to rows of pair_grads what lanes have for them: value k to column(k), which is k below 8. A lane with row -1
+/// has nothing. `of_lanes` has room for 32 (kCount | 1) numbers.
+template <int kCount, class Column>
+__device__ void add_to_rows(float* of_lanes, const float (&values)[kCount], int32_t row, float* pair_grads,
+                            Column&& column) {
+  constexpr int kStride = kCount | 1, kAtOnce = 32 / kCount;  // rows that are added to together
+  const int lane = lane_id(), own = lane / kCount, k = lane % kCount;
+  const uint32_t alike = __match_any_sync(kAllLanes, row);
+  const bool alone = RayPolicy::kAddsAlone && (alike & (alike - 1)) == 0;
+  if (row >= 0 && alone) {
+    float* const to = pair_grads + int64_t(row) * kPairGradWidth;
+    constexpr int kFours = kCount / 4 * 4;
+    AR_UNROLL for (int v = 0; v < kFours; v += 4) add_four(to + v, values + v);
+    AR_UNROLL for (int v = kFours; v < kCount; ++v) atomicAdd(to + column(v), values[v]);
+  }
+  uint32_t leaders = __ballot_sync(kAllLanes, row >= 0 && !alone && (alike & ((1u << lane) - 1)) == 0);
+  if (leaders != 0) {
+    AR_UNROLL for (int v = 0; v < kCount; ++v) of_lanes[lane * kStride + v] = values[v];
+  }
+  __syncwarp();
+  while (leaders != 0) {
+    int leader = -1;
+    AR_UNROLL for (int g = 0; g < kAtOnce; ++g) {
+      if (g == own) leader = __ffs(int(leaders)) - 1;
+      leaders &= leaders - 1;  // zero stays zero
+    }
+    uint32_t members = shuffle(alike, leader & 31);
+    const int32_t to = shuffle(row, leader & 31);
+    if (leader >= 0) {
+      float sum = 0;
+      for (; members != 0; members &= members - 1) sum += of_lanes[(__ffs(int(members)) - 1) * kStride + k];
+      atomicAdd(pair_grads + int64_t(to) * kPairGradWidth + column(k), sum);
+    }
+    __syncwarp();
+  }
+}
+
 /// A splat that a lane has composited.
 struct RayEvent {
-  static constexpr int kNone = std::numeric_limits<int>::min(), kLost = std::numeric_limits<int>::max();
-
-  int distance = kNone;     ///< ordered as depths; kLost: no longer in the log
-  SlotPair pair = {0, -1};  ///< slot -1: of none
-  float raw = 0;            ///< if kLogsRaw
-
-  RayEvent() = default;
-  /// Bits of positive numbers have their order; others only come in another.
-  __device__ RayEvent(float depth, SlotPair pair, float raw) : pair(pair), raw(raw) {
-    distance = min(max(__float_as_int(depth), kNone + 1), kLost - 1);
-  }
+  SlotPair pair;
+  float raw;  ///< if kLogsRaw
 };
 
 /// A lane's own part of the log.
@@ -51,22 +89,21 @@ template <class F> class LaneLog {
 
   __device__ void put(int row, const RayEvent& event) const {
     uint32_t* const to = row_at(row);
-    to[0] = uint32_t(event.distance);
-    to[32] = uint32_t(event.pair.splat);
-    to[64] = uint32_t(event.pair.slot);
-    if constexpr (kLogsRaw<F>) to[96] = __float_as_uint(event.raw);
+    to[0] = uint32_t(event.pair.splat);
+    to[32] = uint32_t(event.pair.slot);
+    if constexpr (kLogsRaw<F>) to[64] = __float_as_uint(event.raw);
   }
-  /// May be called for rows that were not put.
-  __device__ RayEvent event(int row) const {
+  /// None if the lane has not put `row`.
+  __device__ RayEvent event(int row, bool put) const {
     const uint32_t* const from = row_at(row);
-    RayEvent event;
-    event.distance = int(from[0]);
-    event.pair = {int32_t(from[32]), int32_t(from[64])};
-    if constexpr (kLogsRaw<F>) event.raw = __int_as_float(int(from[96]));
+    RayEvent event = {{0, -1}, 0};
+    if (!put) return event;
+    event.pair = {int32_t(from[0]), int32_t(from[32])};
+    if constexpr (kLogsRaw<F>) event.raw = __int_as_float(int(from[64]));
     return event;
   }
   __device__ Places& places(int row) const {
-    return reinterpret_cast<Places*>(row_at(row) - lane_id() + 96)[lane_id()];
+    return reinterpret_cast<Places*>(row_at(row) - lane_id() + 64)[lane_id()];
   }
 
  private:
@@ -105,44 +142,31 @@ template <class F, int C> struct RayAdjoint {
 
 template <class F, int C> class RayWalkBack {
  public:
-  __device__ RayWalkBack(const BlendVjpParams& params, const TileList& list, Vec2<float> p, const LaneLog<F>& log)
-      : params_(params), list_(list), p_(p), log_(log) {}
+  __device__ RayWalkBack(const BlendVjpParams& params, const TileList& list, Vec2<float> p, const LaneLog<F>& log,
+                         float* of_lanes)
+      : params_(params), list_(list), p_(p), log_(log), of_lanes_(of_lanes) {}
 
-  /// Events of each lane before `end`, from the last to the first, until one is lost. Returns how many are left.
+  /// Events of each lane before `end`, from the last to the first that the log keeps. Returns how many are left.
   __device__ int run(int end, RayAdjoint<F, C>& adjoint) const {
-    const int lost = max(end - log_.rows, 0);
-    const auto checked = [&](RayEvent event, int row) {
-      if (row < lost) event.distance = row < 0 ? RayEvent::kNone : RayEvent::kLost, event.pair = {0, -1};
-      return event;
-    };
-    RayEvent event = checked(log_.event(end - 1), end - 1), next = checked(log_.event(end - 2), end - 2);
-    const int value = summed_value<kRaySums<C>>(lane_id());
-    float* const sums = params_.pair_grads + (value < kPairMeans ? value : kPairFourthChannel);
-    for (;;) {
-      const int farthest = warp_max(event.distance);
-      if (farthest == RayEvent::kNone || farthest == RayEvent::kLost) return end;
-      const int lane = __ffs(int(__ballot_sync(kAllLanes, event.distance == farthest))) - 1;
-      const SlotPair pair = {shuffle(event.pair.splat, lane), shuffle(event.pair.slot, lane)};
-      const RayEvent after = log_.event(end - 3);  // used, and waited for, at the end
-      const Splat<F, float> splat = load_splat<F>(params_.splats, pair.splat);
-      const bool mine = event.pair.slot == pair.slot;
+    const int rows = warp_max(end), begin = max(rows - log_.rows, 0);
+    const auto load = [&](int row) { return log_.event(row, (row >= begin) & (row < end)); };
+    RayEvent event = load(rows - 1), next = load(rows - 2);
+    for (int row = rows - 1; row >= begin; --row) {
+      const RayEvent after = load(row - 2);  // while this row is worked on
+      if constexpr (F::kMoves) prefetch(&log_.places(row - 1));
+      prefetch_splat(params_.splats, next.pair.splat);
+      const Splat<F, float> splat = load_splat<F>(params_.splats, event.pair.splat);
       float values[kRaySums<C>] = {};
       float means[2] = {0, 0};
-      if (mine) add(splat, pair.splat, end - 1, event.raw, adjoint, values, means);
-      const int64_t row = int64_t(pair.slot) * kPairGradWidth;
-      const float sum = sum_values(values);
-      if (has_value_first<kRaySums<C>>(lane_id())) atomicAdd(sums + row, sum);
-      if (params_.mean_sums != MeanSums::kNone) {
-        const float total = warp_sum_of_two(means[0], means[1]);
-        if (lane_id() % 16 == 0) atomicAdd(params_.pair_grads + row + kPairMeans + lane_id() / 16, total);
-      }
-      if (!mine) continue;
-      --end;
+      if (event.pair.slot >= 0) add(splat, event.pair.splat, row, event.raw, adjoint, values, means);
+      add_to_rows(of_lanes_, values, event.pair.slot, params_.pair_grads,
+                  [](int k) { return k < kPairMeans ? k : kPairFourthChannel; });
+      if (params_.mean_sums != MeanSums::kNone)
+        add_to_rows(of_lanes_, means, event.pair.slot, params_.pair_grads, [](int k) { return kPairMeans + k; });
       event = next;
-      next = checked(after, end - 2);
-      prefetch_splat(params_.splats, next.pair.splat);
-      if constexpr (F::kMoves) prefetch(&log_.places(end - 2));
+      next = after;
     }
+    return min(end, begin);
   }
 
  private:
@@ -200,6 +224,7 @@ template <class F, int C> class RayWalkBack {
   const TileList& list_;
   const Vec2<float> p_;
   const LaneLog<F>& log_;
+  float* const of_lanes_;
 };
 
 /// Composites half of the tile, each lane up to event `end`. Returns the lane's events.
@@ -235,7 +260,7 @@ __device__ int log_rays(const BlendVjpParams& params, const TileList& list, int 
             if (open & (samples.transmittance[s] < 0)) adjoint.stopped[s] = row;
           }
           if (!any) continue;
-          log.put(row, {entries[i].depth, pairs[i], raw});
+          log.put(row, {pairs[i], raw});
           if constexpr (F::kMoves) log.places(row) = before;
           ++row;
         }
@@ -262,7 +287,9 @@ __global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_vjp_kernel(
       const Vec2<float> p = ray_pixel(half);
       const Pixel pixel(list, params.grid, p);
       RayAdjoint<F, C> adjoint(params, pixel);
-      const RayWalkBack<F, C> back(params, list, p, log);
+      // The stage is free then.
+      static_assert(sizeof(RayStage<F>) >= 32 * (kRaySums<C> | 1) * sizeof(float));
+      const RayWalkBack<F, C> back(params, list, p, log, reinterpret_cast<float*>(dynamic_shared()));
       for (int end = kAll; __any_sync(kAllLanes, end > 0);) {
         RaySamples<F> samples(pixel.inside && end > 0);
         const int events = log_rays<F>(params, list, half, samples, log, end, adjoint);

@@ -5,6 +5,8 @@
 // sort, and composite what leaves.
 #pragma once
 
+#include <limits>
+
 #include "core/order.h"
 #include "cuda/launch.cuh"
 #include "cuda/rays/policy.h"
@@ -37,18 +39,20 @@ struct alignas(8) RayEntry {
   int32_t payload = -1;
 };
 
-/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. Slot k is at 32
-/// k: no two lanes meet in a bank.
+/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. What has left, and
+/// a slot before all, has the depth kPassed. Slot k is at 32 k: no two lanes meet in a bank.
 class RayWindow {
  public:
   /// Slots before `memory` that may be read.
   static constexpr int kTogether = RayPolicy::kTogether;
 
-  __device__ RayWindow(RayEntry* memory, int window) : slots_(memory + lane_id()), window_(32 * window) {}
+  __device__ RayWindow(RayEntry* memory, int window) : slots_(memory + 32 + lane_id()), window_(32 * window) {
+    slots_[-32].depth = kPassed;
+  }
 
   __device__ __host__ static int64_t bytes(int window) {
     const int rounded = (window + kTogether - 1) / kTogether * kTogether;
-    return int64_t(rounded + RayPolicy::kPending) * 32 * int64_t(sizeof(RayEntry));
+    return int64_t(1 + rounded + RayPolicy::kPending) * 32 * int64_t(sizeof(RayEntry));
   }
   __device__ bool full() const { return end_ == window_ + 32 * RayPolicy::kPending; }
   __device__ void drop() { first_ = sorted_ = end_ = 0; }
@@ -61,20 +65,20 @@ class RayWindow {
   __device__ void sort() {
     for (; sorted_ < end_; sorted_ += 32) {
       const RayEntry entry = slots_[sorted_];
-      const int nearest = max(sorted_ - window_, 0);  // of the window; slots before it have left
       int to = sorted_;
       for (bool nearer = true; nearer;) {
         const int from = to;
         RayEntry before[kTogether];
         AR_UNROLL for (int i = 0; i < kTogether; ++i) before[i] = slots_[from - 32 * (i + 1)];
         AR_UNROLL for (int i = 0; i < kTogether; ++i) {
-          nearer = nearer & (from - 32 * i > nearest) & (entry.depth < before[i].depth);
+          nearer = nearer & (entry.depth < before[i].depth);
           if (!nearer) continue;
           slots_[from - 32 * i] = before[i];
           to = from - 32 * (i + 1);
         }
       }
       slots_[to] = entry;
+      if (sorted_ >= window_) slots_[sorted_ - window_].depth = kPassed;
     }
   }
   /// After sort(): whether something has left. `all`: at the end of the list.
@@ -101,6 +105,8 @@ class RayWindow {
   }
 
  private:
+  static constexpr float kPassed = -std::numeric_limits<float>::infinity();  ///< no entry goes before it
+
   RayEntry* const slots_;
   const int window_;
   int first_ = 0, sorted_ = 0, end_ = 0;
