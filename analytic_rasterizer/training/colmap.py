@@ -59,6 +59,9 @@ BY_NAME = {model.name: model for model in MODELS}
 CAMERAS, IMAGES, POINTS = "cameras", "images", "points3D"
 SUFFIXES = (".bin", ".txt")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point3D", "<u8")])
+POINT = np.dtype(
+    [("point3D", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+)  # a track is as long as its number
 
 
 class Registered(NamedTuple):
@@ -176,19 +179,18 @@ def load_tracks(folder: Path) -> dict[str, Tensor]:
     return {item.view.name: observed[item.name] for item in load_views(folder) if len(observed[item.name])}
 
 
-def _points(folder: Path) -> tuple[Path | None, list, Tensor]:
+def _points(folder: Path) -> tuple[Path | None, Sequence, Tensor]:
     """The file of the points, or None; their P identifiers; and positions and colours, (P, 6) float64."""
     preferred = _suffix(folder) or SUFFIXES[0]
     files = (folder / f"{POINTS}{suffix}" for suffix in sorted(SUFFIXES, key=lambda suffix: suffix != preferred))
     path = next((path for path in files if path.is_file()), None)
-    if path is None:
-        rows = []
-    elif path.suffix == ".bin":
-        rows = list(_binary_points(path))
-    else:
-        rows = [(words[0], *_floats(path, words[1:7])) for words in _lines(path)]
-        if any(len(row) != 7 for row in rows):
-            raise io.SceneError(f"{path}: cut short")
+    if path is not None and path.suffix == ".bin":
+        points = _binary_points(path)
+        numbers = np.concatenate([points["position"], points["color"]], axis=1)
+        return path, points["point3D"], torch.from_numpy(numbers)
+    rows = [] if path is None else [(words[0], *_floats(path, words[1:7])) for words in _lines(path)]
+    if any(len(row) != 7 for row in rows):
+        raise io.SceneError(f"{path}: cut short")
     numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 6)
     return path, [row[0] for row in rows], torch.from_numpy(numbers)
 
@@ -233,12 +235,19 @@ def _binary_images(path: Path) -> Iterator[tuple]:
         yield file_name, pose, camera, observations["point3D"]
 
 
-def _binary_points(path: Path) -> Iterator[list[float]]:
+def _binary_points(path: Path) -> np.ndarray:
+    """All as `POINT`. Files may have millions, so that little is done for each."""
     records = _Records(path)
-    for _ in range(records.count):
-        *row, _, track = records.take("Q3d3BdQ")
-        records.skip(8 * track)  # picture, observation in it
-        yield row
+    data, start, found = records.data, records.position, []
+    to_track, size, track_of = POINT.fields["track"][1], POINT.itemsize, struct.Struct("<Q").unpack_from
+    try:
+        for _ in range(records.count):
+            found.append(data[start : start + size])
+            start += size + 8 * track_of(data, start + to_track)[0]  # picture, observation in it
+    except struct.error:
+        start = len(data) + 1
+    records.skip(start - records.position)  # raises where the file is cut short
+    return np.frombuffer(b"".join(found), POINT)
 
 
 class _Records:

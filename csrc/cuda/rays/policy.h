@@ -11,10 +11,7 @@ struct RayPolicy {
   /// Slots of a window that are read together: waiting, against reads in vain.
   static constexpr int kTogether = 4;
   /// Entries of a lane whose splats are loaded together: waiting, against registers.
-  template <class F> static constexpr int kAtOnce = F::kSamples > 1 ? 1 : 2;
-
-  /// Whether lanes that are alone with their splat add its sums themselves: fewer instructions, more requests.
-  static constexpr bool kAddsAlone = true;
+  template <class F> static constexpr int kAtOnce = F::kSamples > 1 ? 2 : 4;
 
   /// Blocks, of a warp, on a multiprocessor, against registers. Some devices hold no more.
   static constexpr int kBlocks = 16;

@@ -1,7 +1,7 @@
 // Kernel blend_rays_vjp: the backward pass in the order along rays, for up to four channels. The order is taken as
 // given. A block is a warp. It composites half a tile again, each lane logging what it composited (RayLog), and walks
-// the log back, row by row. Lanes are at different splats: in a row, lanes with the same splat are added up, lane after
-// lane. No other warp has the tile, and __syncwarp() is between rows: sums have a fixed order, but for tiles of a patch.
+// the log back, row by row. Lanes are at different splats: those with the same splat are added up, lane after lane. No
+// other warp has the tile, and __syncwarp() is between rows: sums have a fixed order, but for tiles of a patch.
 //
 // The log keeps the last rows. If there were more, the warp composites the half again, up to the first row kept.
 #pragma once
@@ -21,17 +21,6 @@ template <class F> inline constexpr int kLogWords = 2 + (F::kMoves ? 2 * F::kSam
 /// Values of PairGrad and C channels.
 template <int C> inline constexpr int kRaySums = kPairChannels + C;
 
-/// Adds to four numbers, which are aligned.
-__device__ inline void add_four(float* to, const float* values) {
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && CUDART_VERSION >= 12010
-  asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(to), "f"(values[0]), "f"(values[1]),
-               "f"(values[2]), "f"(values[3])
-               : "memory");
-#else
-  AR_UNROLL for (int v = 0; v < 4; ++v) atomicAdd(to + v, values[v]);
-#endif
-}
-
 /// Adds to rows of pair_grads what lanes have for them: value k to column(k), which is k below 8. A lane with row -1
 /// has nothing. `of_lanes` has room for 32 (kCount | 1) numbers.
 template <int kCount, class Column>
@@ -40,17 +29,8 @@ __device__ void add_to_rows(float* of_lanes, const float (&values)[kCount], int3
   constexpr int kStride = kCount | 1, kAtOnce = 32 / kCount;  // rows that are added to together
   const int lane = lane_id(), own = lane / kCount, k = lane % kCount;
   const uint32_t alike = __match_any_sync(kAllLanes, row);
-  const bool alone = RayPolicy::kAddsAlone && (alike & (alike - 1)) == 0;
-  if (row >= 0 && alone) {
-    float* const to = pair_grads + int64_t(row) * kPairGradWidth;
-    constexpr int kFours = kCount / 4 * 4;
-    AR_UNROLL for (int v = 0; v < kFours; v += 4) add_four(to + v, values + v);
-    AR_UNROLL for (int v = kFours; v < kCount; ++v) atomicAdd(to + column(v), values[v]);
-  }
-  uint32_t leaders = __ballot_sync(kAllLanes, row >= 0 && !alone && (alike & ((1u << lane) - 1)) == 0);
-  if (leaders != 0) {
-    AR_UNROLL for (int v = 0; v < kCount; ++v) of_lanes[lane * kStride + v] = values[v];
-  }
+  AR_UNROLL for (int v = 0; v < kCount; ++v) of_lanes[lane * kStride + v] = values[v];
+  uint32_t leaders = __ballot_sync(kAllLanes, row >= 0 && (alike & ((1u << lane) - 1)) == 0);
   __syncwarp();
   while (leaders != 0) {
     int leader = -1;

@@ -39,8 +39,8 @@ struct alignas(8) RayEntry {
   int32_t payload = -1;
 };
 
-/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. What has left, and
-/// a slot before all, has the depth kPassed. Slot k is at 32 k: no two lanes meet in a bank.
+/// Of a lane. From the first slot on: what has left, the window sorted by depth, and what is to enter. What has left,
+/// and a slot before all, has the depth kPassed. Slot k is at 32 k: no two lanes meet in a bank.
 class RayWindow {
  public:
   /// Slots before `memory` that may be read.
