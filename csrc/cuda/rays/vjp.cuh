@@ -128,6 +128,7 @@ template <class F, int C> class RayWalkBack {
 
   /// Events of each lane before `end`, from the last to the first that the log keeps. Returns how many are left.
   __device__ int run(int end, RayAdjoint<F, C>& adjoint) const {
+    __syncwarp();  // windows read what is before them, and so `of_lanes`
     const int rows = warp_max(end), begin = max(rows - log_.rows, 0);
     const auto load = [&](int row) { return log_.event(row, (row >= begin) & (row < end)); };
     RayEvent event = load(rows - 1), next = load(rows - 2);
