@@ -14,20 +14,13 @@ import torch
 from torch import Tensor
 
 from .. import ops  # noqa: F401  (registers the fake kernels)
+from .correction_adam import BEGIN, CorrectionAdam
 
-# Until so much of the training is over nothing is learned: corrections of a scene that has no shape yet would hide its
-# errors. docs/internals/training.md has what was tried.
-BEGIN = 0.1
-RATE = 3e-3  # learning rate when it begins; it falls exponentially
-RATE_END = 0.1  # of it, at the end
-BETAS, EPS = (0.9, 0.999), 1e-8
 GAMMA = 2.2  # stored values are nearly light^(1 / GAMMA), and black stays black
-
-_adam = torch.ops.analytic_rasterizer.adam_.default
 
 
 class Exposures:
-    """The corrections of V photographs, and their optimizer: Adam, with one count of steps for all.
+    """The corrections of V photographs, and their optimizer.
 
     Attributes:
         matrices: (V, 3, 4) float32, (A | b) of each.
@@ -35,8 +28,7 @@ class Exposures:
 
     def __init__(self, count: int, device: torch.device):
         self.matrices = torch.eye(3, 4, dtype=torch.float32, device=device).repeat(count, 1, 1)
-        self.moments = [torch.zeros_like(self.matrices) for _ in BETAS]
-        self.steps = 0
+        self.optimizer = CorrectionAdam(self.matrices)
 
     def start(self, stops: Tensor) -> None:
         """Starts from what was measured.
@@ -56,28 +48,17 @@ class Exposures:
         """Takes a step with gradients (3, 4) of some photographs, when `share` of the training is over."""
         if share < BEGIN:
             return
-        rate = rate_at(share)
         for view, gradient in gradients.items():
-            matrix, moments = self.matrices[view], [moment[view] for moment in self.moments]
-            before = matrix.clone()
-            self.steps += 1
-            _adam([matrix], [gradient], *([m] for m in moments), [rate], [self.steps], *BETAS, EPS)
+            before = self.matrices[view].clone()
+            self.optimizer.step(gradient, share, view)
             # So the mean stays where it was.
-            self.matrices.add_(before.sub_(matrix), alpha=1 / len(self.matrices))
+            self.matrices.add_(before.sub_(self.matrices[view]), alpha=1 / len(self.matrices))
 
     def state_dict(self) -> dict[str, Any]:
-        return {"matrices": self.matrices, "moments": self.moments, "steps": self.steps}
+        return self.optimizer.state_dict("matrices")
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.matrices.copy_(state["matrices"])
-        for own, moment in zip(self.moments, state["moments"]):
-            own.copy_(moment)
-        self.steps = state["steps"]
-
-
-def rate_at(share: float) -> float:
-    """The learning rate of corrections, when `share` of the training is over, BEGIN or more."""
-    return RATE * RATE_END ** min((share - BEGIN) / (1 - BEGIN), 1.0)
+        self.optimizer.load_state_dict("matrices", state)
 
 
 def corrected(

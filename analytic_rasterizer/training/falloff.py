@@ -16,19 +16,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import io, ops  # noqa: F401  (registers the fake kernels)
+from .. import io
 from ..cameras.lens import SPHERE
-from .exposure import BEGIN, BETAS, EPS, GAMMA, rate_at
+from .correction_adam import BEGIN, CorrectionAdam
+from .exposure import GAMMA
 from .vignetting import ONE_LENS, POWERS, cameras_of
 
 SAMPLES = 64  # of the squares of radii to which a polynomial is fitted
 SAME_SHAPE = 0.01  # share by which proportions of pictures of one camera may differ, cut to a multiple of the scale
 
-_adam = torch.ops.analytic_rasterizer.adam_.default
-
 
 class Falloffs:
-    """The polynomials of the cameras that took V photographs, and their optimizer, Adam.
+    """The polynomials of the cameras that took V photographs, and their optimizer.
 
     Args:
         views: Of the photographs.
@@ -48,8 +47,7 @@ class Falloffs:
                 self.camera[place] = number
         self.views = views
         self.coefficients = torch.zeros(len(self.cameras), len(POWERS), dtype=torch.float32, device=device)
-        self.moments = [torch.zeros_like(self.coefficients) for _ in BETAS]
-        self.steps = 0
+        self.optimizer = CorrectionAdam(self.coefficients)
 
     def start(self, measured: Mapping[int, tuple[Tensor, float]]) -> None:
         """Starts from what was measured.
@@ -78,18 +76,13 @@ class Falloffs:
         summed = torch.zeros_like(self.coefficients)
         for place, gradient in gradients.items():
             summed[self.camera[place]] += gradient
-        self.steps += 1
-        moments = ([moment] for moment in self.moments)
-        _adam([self.coefficients], [summed], *moments, [rate_at(share)], [self.steps], *BETAS, EPS)
+        self.optimizer.step(summed, share)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"coefficients": self.coefficients, "moments": self.moments, "steps": self.steps}
+        return self.optimizer.state_dict("coefficients")
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.coefficients.copy_(state["coefficients"])
-        for own, moment in zip(self.moments, state["moments"]):
-            own.copy_(moment)
-        self.steps = state["steps"]
+        self.optimizer.load_state_dict("coefficients", state)
 
     def to_json(self) -> list[dict[str, Any]]:
         """What `read_falloffs` reads: for each camera its picture and focal length [px], and its photographs."""
