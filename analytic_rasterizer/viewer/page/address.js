@@ -8,14 +8,10 @@ import { hexOf, rgbOf } from './interface.js';
 export function readAddress(viewer) {
   const given = new URLSearchParams(location.hash.slice(1)), { state, camera, meta } = viewer;
   const valid = name => {
-    try {
-      return name !== null && viewer.footprint(name) !== null;
-    } catch {
-      return false;
-    }
+    try { return name !== null && Boolean(viewer.footprint(name)); } catch { return false; }
   };
-  const view = Number(given.get('view') ?? -1);
-  if (Number.isInteger(view) && view >= 0 && view < meta.views.length && given.has('view')) {
+  const view = Number(given.get('view') ?? NaN);
+  if (meta.views[view]) {
     camera.setView(view);
     viewer.atView = true;
   }

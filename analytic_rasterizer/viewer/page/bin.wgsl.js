@@ -124,11 +124,7 @@ ${MAIN}
   starts[t] = saturated(blocks[block.x], inclusive(t, number) - number);
   workgroupBarrier();
   if (place < counts[1]) {
-    if (number > ${LARGE}u) {
-      large[atomicAdd(&largeCount, 1u)] = place;
-    } else {
-      write(place, 0u, 1u);
-    }
+    if (number > ${LARGE}u) { large[atomicAdd(&largeCount, 1u)] = place; } else { write(place, 0u, 1u); }
   }
   workgroupBarrier();
   let many = atomicLoad(&largeCount);

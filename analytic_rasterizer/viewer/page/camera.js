@@ -5,7 +5,7 @@ import { CONSTANTS } from './constants.js';
 
 export const add = (a, b) => a.map((value, i) => value + b[i]);
 export const times = (a, factor) => a.map(value => value * factor);
-export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 export const cross = (a, b) => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
@@ -25,15 +25,14 @@ function turned(v, axis, angle) {
 
 /// The quaternion of a rotation matrix, given by its rows.
 function quaternionOf([x, y, z]) {
-  const trace = x[0] + y[1] + z[2];
-  const q = trace > 0
-    ? [1 + trace, z[1] - y[2], x[2] - z[0], y[0] - x[1]]
-    : x[0] >= y[1] && x[0] >= z[2]
-      ? [z[1] - y[2], 1 + x[0] - y[1] - z[2], x[1] + y[0], x[2] + z[0]]
-      : y[1] >= z[2]
-        ? [x[2] - z[0], x[1] + y[0], 1 + y[1] - x[0] - z[2], y[2] + z[1]]
-        : [y[0] - x[1], x[2] + z[0], y[2] + z[1], 1 + z[2] - x[0] - y[1]];
-  return unit(q);
+  // Its multiples by four times each of its numbers, of which the longest is the most exact.
+  const multiples = [
+    [1 + x[0] + y[1] + z[2], z[1] - y[2], x[2] - z[0], y[0] - x[1]],
+    [z[1] - y[2], 1 + x[0] - y[1] - z[2], x[1] + y[0], x[2] + z[0]],
+    [x[2] - z[0], x[1] + y[0], 1 + y[1] - x[0] - z[2], y[2] + z[1]],
+    [y[0] - x[1], x[2] + z[0], y[2] + z[1], 1 + z[2] - x[0] - y[1]],
+  ];
+  return unit(multiples.sort((a, b) => dot(b, b) - dot(a, a))[0]);
 }
 
 /// Rows of the rotation matrix of a quaternion.
@@ -50,11 +49,9 @@ function rotationOf(quaternion) {
 export function between(from, to, part) {
   const a = quaternionOf(from.axes), b = quaternionOf(to.axes);
   const mix = (u, v) => add(times(u, 1 - part), times(v, part));
-  // Of the two quaternions of a rotation the nearer one.
-  const same = a.reduce((sum, value, i) => sum + value * b[i], 0) >= 0;
   return {
     position: mix(from.position, to.position),
-    axes: rotationOf(mix(a, same ? b : times(b, -1))),
+    axes: rotationOf(mix(a, times(b, dot(a, b) < 0 ? -1 : 1))),  // of both quaternions of a rotation the nearer one
     distance: mix([from.distance], [to.distance])[0],
   };
 }
@@ -84,7 +81,7 @@ export class Camera {
   poseOfView(k) {
     const m = this.meta.views[k].w2c;
     const axes = [0, 1, 2].map(r => unit(m.slice(4 * r, 4 * r + 3)));
-    const position = [0, 1, 2].map(c => -(axes[0][c] * m[3] + axes[1][c] * m[7] + axes[2][c] * m[11]));
+    const { eye: position } = eyeAndLimits(this.meta.views[k]);
     const ahead = dot(minus(this.meta.center, position), axes[2]);
     return { position, axes, distance: Math.max(ahead, 0.1 * this.meta.radius) };
   }
@@ -167,11 +164,9 @@ export class Camera {
   }
 
   static poseFromText(text) {
-    const numbers = text.split(',').map(Number);
-    const quaternion = numbers.slice(3, 7);
-    if (numbers.length !== 8 || !numbers.every(Number.isFinite) || Math.hypot(...quaternion) === 0) return null;
-    if (!(numbers[7] > 0)) return null;
-    return { position: numbers.slice(0, 3), axes: rotationOf(quaternion), distance: numbers[7] };
+    const numbers = text.split(',').map(Number), quaternion = numbers.slice(3, 7), distance = numbers[7];
+    const valid = numbers.length === 8 && numbers.every(Number.isFinite) && quaternion.some(Boolean) && distance > 0;
+    return valid ? { position: numbers.slice(0, 3), axes: rotationOf(quaternion), distance } : null;
   }
 }
 

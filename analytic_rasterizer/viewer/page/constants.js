@@ -1,25 +1,12 @@
 // Numbers of the rasterizer, by their names in csrc/core. tests/viewer/test_viewer.py compares them with the headers.
 
 export const CONSTANTS = {
-  kNear: 0.2,
-  kFrustumClamp: 1.3,
-  kAlphaMin: 1 / 255,
-  kLogAlphaMin: -7.99445,
-  kAlphaMax: 0.99,
-  kTransmittanceMin: 1e-4,
-  kPixelVariance: 1 / 12,
-  kLevelSlack: 0.01,
-  kMaxDet: 1e30,
-  kMaxScale: 1e18,
-  kMaxOpacity: 1e6,
-  kMaxWhitening: 1e7,
-  kBase2: 0.8493218002880191,
-  kLog2e: 1.4426950408889634,
-  kPi: 3.141592653589793,
-  kLogistic1: 1.6,
-  kLogistic3: 0.07,
-  kMinSigma: 1e-6,
-  kOrder4: 1 / 2880,
+  kNear: 0.2, kFrustumClamp: 1.3,
+  kAlphaMin: 1 / 255, kLogAlphaMin: -7.99445, kAlphaMax: 0.99, kTransmittanceMin: 1e-4,
+  kMaxDet: 1e30, kMaxScale: 1e18, kMaxOpacity: 1e6, kMaxWhitening: 1e7,
+  kPixelVariance: 1 / 12, kLevelSlack: 0.01, kMinSigma: 1e-6,
+  kLogistic1: 1.6, kLogistic3: 0.07, kOrder4: 1 / 2880,
+  kBase2: 0.8493218002880191, kLog2e: 1.4426950408889634, kPi: 3.141592653589793,
 };
 
 // 1 - exp(-x) = x (m0 + m1 x + ...) for x < 1/2: one_minus_exp_ratio of csrc/core/lanes.h.
@@ -28,7 +15,7 @@ export const MINIMAX = [
 ];
 
 // Half of the nodes of a pixel [px], box_node of csrc/core/footprint/gaussian.h; the other half is opposite.
-export const HALF_NODES = {
+const HALF_NODES = {
   4: [[-0.12083, -0.36226], [0.36226, -0.12083]],
   16: [
     [0.26975, -0.14597], [0.14427, -0.43939], [0.062, -0.14646], [0.18749, 0.1472],
@@ -49,10 +36,8 @@ export function cellsOf(samples) {
 }
 
 /// A float in the text of a shader, of WGSL or of GLSL.
-export const shaderNumber = value => {
-  if (Number.isInteger(value) && Math.abs(value) < 1e6) return `${value.toFixed(1)}f`;
-  return `${value.toPrecision(12)}f`;
-};
+export const shaderNumber = value =>
+  `${Number.isInteger(value) && Math.abs(value) < 1e6 ? value.toFixed(1) : value.toPrecision(12)}f`;
 
 /// In place of a footprint to compare with.
 export const PHOTOGRAPH = 'photograph';

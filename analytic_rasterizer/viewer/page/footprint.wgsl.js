@@ -70,12 +70,10 @@ export const KINDS = {
   level += dot(conic, conic) / 124.0;`,
     ellipse: GAUSSIAN.ellipse,
     slots: 4,
-    terms: `
-      let w = kBase2 * vec3f(s.a.zw, s.b.x);
+    terms: `${GAUSSIAN.terms}
       let unit = kOrder4 * kLog2e; let scale = 1.0 / (kBase2 * kBase2);
       let a = dot(w.xy, w.xy); let c = w.z * w.z;
-      slot0[t] = vec4f(w, s.b.w - cumulantConstant(a, unit, scale) - cumulantConstant(c, unit, scale));
-      slot1[t] = vec4f(whitened(w, origin), 0.0, 0.0);
+      slot0[t].w = s.b.w - cumulantConstant(a, unit, scale) - cumulantConstant(c, unit, scale);
       slot2[t] = cumulantAxis(a, unit, scale);
       slot3[t] = cumulantAxis(c, unit, scale);`,
     pixel: GAUSSIAN.pixel,

@@ -6,7 +6,6 @@ import { CONSTANTS, shaderNumber } from './constants.js';
 
 export const TILE = 8;          // edge of a tile [px]
 export const WORKGROUP = 256;   // threads
-
 export const FRAME_BYTES = 144;
 
 export const FRAME = `

@@ -1,5 +1,6 @@
 // The controls: what the user does becomes calls of the viewer, and what the viewer shows becomes text.
 
+import { add, times } from './camera.js';
 import { PHOTOGRAPH } from './constants.js';
 
 const element = id => document.getElementById(id);
@@ -65,7 +66,6 @@ export class Interface {
     this.surface = element('surface');
     this.actions = this.actionsOf(viewer);
     this.fillIn(viewer.meta);
-    this.showRenderer();
     this.connectControls();
     this.connectPointers();
     this.connectKeys();
@@ -73,7 +73,7 @@ export class Interface {
     const small = matchMedia(SMALL_WINDOW), fold = () => this.toggleFolded(small.matches);
     small.addEventListener('change', fold);
     fold();
-    this.update();
+    this.showRenderer();
   }
 
   fillIn(meta) {
@@ -85,7 +85,7 @@ export class Interface {
     for (const id of ['previous', 'next']) element(id).disabled = meta.views.length < 2;
   }
 
-  /// Says which renderer draws and why, and offers what it can draw.
+  /// Says which renderer draws and why, offers what it can draw, and shows what is chosen.
   showRenderer() {
     const { meta, renderer, reason } = this.viewer;
     const known = meta.footprints.some(({ name }) => name === meta.footprint);
@@ -101,6 +101,7 @@ export class Interface {
     const lacks = all.some(footprint => !renderer.draws(footprint));
     element('renderer').textContent = `${renderer.name} draws${reason ? `: ${reason}` : '.'}` +
       `${lacks ? ' Footprints in grey need WebGPU.' : ''}`;
+    this.update();
   }
 
   connectControls() {
@@ -133,13 +134,12 @@ export class Interface {
     surface.addEventListener('pointermove', event => {
       const old = pointers.get(event.pointerId);
       if (!old) return;
-      const now = place(event), others = [...pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+      const now = place(event), [, other] = [...pointers].find(([id]) => id !== event.pointerId) ?? [];
       pointers.set(event.pointerId, now);
       const x = now.x - old.x, y = now.y - old.y;
-      if (others.length > 0) {
-        const before = Math.hypot(old.x - others[0].x, old.y - others[0].y);
-        const after = Math.hypot(now.x - others[0].x, now.y - others[0].y);
-        viewer.steer('dolly', Math.max(before, 1) / Math.max(after, 1));
+      if (other) {
+        const apart = at => Math.max(Math.hypot(at.x - other.x, at.y - other.y), 1);
+        viewer.steer('dolly', apart(old) / apart(now));
         viewer.pan(x / 2, y / 2);
       } else if (event.shiftKey || (event.buttons & 6) !== 0) {
         viewer.pan(x, y);
@@ -182,7 +182,6 @@ export class Interface {
       return true;
     }
     if (key in ARROWS) {
-      if (event.target === element('divider')) return false;
       const [x, y] = ARROWS[key].map(value => value * ARROW_STEP);
       if (event.shiftKey) viewer.steer('pan', x, y);
       else viewer.steer('orbit', -x, -y);
@@ -223,9 +222,7 @@ export class Interface {
   /// Direction of the fly keys that are held, or null.
   flight() {
     if (this.keys.size === 0) return null;
-    const sum = [0, 0, 0];
-    for (const key of this.keys) FLY_KEYS[key].forEach((value, i) => { sum[i] += value; });
-    return sum.map(value => value * (this.faster ? 4 : 1));
+    return times([...this.keys].map(key => FLY_KEYS[key]).reduce(add), this.faster ? 4 : 1);
   }
 
   connectDivider() {
@@ -273,10 +270,9 @@ export class Interface {
     element('resolution').setAttribute('aria-valuetext', resolution);
     element('background').value = hexOf(this.viewer.state.background);
     element('view').value = this.viewer.camera.view;
-    const place = `${100 * divider}%`;
     for (const id of ['divider', 'label-left', 'label-right']) {
       element(id).hidden = !split;
-      element(id).style.left = place;
+      element(id).style.left = `${100 * divider}%`;
     }
     element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
     element('label-left').textContent = this.inWords(footprint);
@@ -303,7 +299,7 @@ export class Interface {
     const parts = Object.entries(stages).map(([name, time]) => `${name} ${time.toFixed(1)}`);
     element('stages').textContent = parts.length > 0 ? `${parts.join(', ')} ms` : '';
     const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
-    const time = `${milliseconds.toFixed(1)} ms per frame`;
-    element('figures').textContent = `${drawn.join(' | ')}, ${width} x ${height}, ${speed}${time}`;
+    const picture = `${drawn.join(' | ')}, ${width} x ${height}`;
+    element('figures').textContent = `${picture}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
   }
 }

@@ -82,10 +82,9 @@ ${KINDS[kind].shape}
   let area = supportOf(s, frame.reach);
   let half = area.halfWidth + area.reach;
   let columns = columnsWithin(centre.x - half, centre.x + half);
-  let rows = rowsOf(area);
+  let rows = rowsOf(area); let tileRows = tilesOf(rows);
   if (columns.x > columns.y || rows.x > rows.y) { return; }
   var count = 0u;
-  let tileRows = tilesOf(rows);
   for (var r = tileRows.x; r <= tileRows.y; r++) {
     let c = tileColumnsOf(area, rows, r);
     count += u32(max(c.y - c.x + 1, 0));

@@ -23,13 +23,10 @@ function coveredPixel(geometry, pinhole, columns) {
 /// The column and row of the brightest of the first `columns` over the background, and how bright it is.
 function brightestPixel(values, { width, height }, columns, background) {
   let found = [0, 0, 0];
-  for (let row = 0; row < height; ++row) {
-    for (let column = 0; column < columns; ++column) {
-      const at = 4 * (row * width + column);
-      for (let c = 0; c < 3; ++c) {
-        const bright = values[at + c] + values[at + 3] * background[c];
-        if (bright > found[2]) found = [column, row, bright];
-      }
+  for (let p = 0; p < width * height; ++p) {
+    for (let c = 0; c < 3 && p % width < columns; ++c) {
+      const bright = values[4 * p + c] + values[4 * p + 3] * background[c];
+      if (bright > found[2]) found = [p % width, Math.floor(p / width), bright];
     }
   }
   return found;

@@ -35,7 +35,7 @@ export class Viewer {
     this.controls = null;
     this.shown = null;  // what was drawn last: pictures by name, camera, and whether it was moving
     this.photographs = new Photographs(() => this.wake());
-    this.paces = new Map();
+    this.paces = {};
     this.settledTime = 0;  // ms
   }
 
@@ -88,7 +88,6 @@ export class Viewer {
     }
     announce('');
     this.controls?.showRenderer();
-    this.controls?.update();
     this.wake();
   }
 
@@ -307,9 +306,7 @@ export class Viewer {
 
   /// The pace at which these footprints can follow the camera.
   paceOf(left, right) {
-    const key = `${left.name} ${right?.name}`;
-    if (!this.paces.has(key)) this.paces.set(key, new Pace(this.settledTime));
-    return this.paces.get(key);
+    return this.paces[`${left.name} ${right?.name}`] ??= new Pace(this.settledTime);
   }
 
   present() {

@@ -78,7 +78,7 @@ export class WebGLRenderer {
     const corners = Uint16Array.from({ length: 6 * SPLATS_PER_INSTANCE }, corner);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    this.programs = new Map();
+    this.programs = {};
     this.pictures = new Map();
   }
 
@@ -103,8 +103,7 @@ export class WebGLRenderer {
 
   /// A program, made once. `vertex` and `fragment` return sources.
   program(key, vertex, fragment) {
-    if (!this.programs.has(key)) this.programs.set(key, createProgram(this.gl, vertex(), fragment()));
-    return this.programs.get(key);
+    return this.programs[key] ??= createProgram(this.gl, vertex(), fragment());
   }
 
   /// The picture with this name; made anew when its size or format changes.

@@ -17,8 +17,7 @@ export class WebGPURenderer {
     if (!adapter) throw new Error('WebGPU finds no graphics device here.');
     const inSoftware = adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter ?? false;
     if (inSoftware && !software) throw new Error('WebGPU would have no graphics device here.');
-    const needed = largestBinding(meta);
-    const { maxStorageBufferBindingSize: most } = adapter.limits;
+    const needed = largestBinding(meta), { maxStorageBufferBindingSize: most } = adapter.limits;
     if (needed > most) {
       const fit = form => Math.floor(most / largestBinding({ ...form, count: 1 })).toLocaleString('en');
       throw new Error(`the scene has ${meta.count.toLocaleString('en')} Gaussians, and WebGPU on this device can hold ` +
@@ -40,7 +39,7 @@ export class WebGPURenderer {
     this.name = 'WebGPU';
     this.pictures = new Map();
     this.rate = null;    // ms for a sample of a pair
-    this.pairs = null;   // of the last picture
+    this.pairs = null;   // of the last picture, as soon as there is a rate
     this.stages = {};    // ms of the last frame, where the device tells
     this.turn = Promise.resolve();
     this.progress = () => {};
@@ -108,7 +107,7 @@ export class WebGPURenderer {
     const made = { width, height, buffer: this.passes.buffer(16 * width * height),
       ranges: this.passes.buffer(8 * (columns * rows + 1)) };
     this.pictures.set(name, made);
-    this.passes.pipelines.groups.clear();
+    this.passes.pipelines.groups = {};
     return made;
   }
 
@@ -161,8 +160,7 @@ export class WebGPURenderer {
 
   /// Bands of rows in which a picture is blended.
   bands(footprint, rows) {
-    const known = this.rate !== null && this.pairs !== null;
-    const wanted = known ? (this.rate * this.pairs * footprint.samples) / BAND_TIME : FIRST_BANDS;
+    const wanted = this.rate === null ? FIRST_BANDS : (this.rate * this.pairs * footprint.samples) / BAND_TIME;
     return Math.min(Math.max(Math.ceil(wanted), 1), rows);
   }
 

@@ -28,7 +28,7 @@ class Pipelines {
   constructor(device) {
     this.device = device;
     this.made = new Map();
-    this.groups = new Map();
+    this.groups = {};
   }
 
   /// Compiles what these steps need. Calls `note` with how many shaders are done and how many there are.
@@ -47,14 +47,12 @@ class Pipelines {
 
   encode(pass, { key, buffers, size }) {
     const pipeline = this.made.get(key), name = [key, ...buffers.map(buffer => buffer.label)].join();
-    if (!this.groups.has(name)) {
-      this.groups.set(name, this.device.createBindGroup({
-        layout: pipeline.getBindGroupLayout(0),
-        entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })),
-      }));
-    }
+    this.groups[name] ??= this.device.createBindGroup({
+      layout: pipeline.getBindGroupLayout(0),
+      entries: buffers.map((buffer, binding) => ({ binding, resource: { buffer } })),
+    });
     pass.setPipeline(pipeline);
-    pass.setBindGroup(0, this.groups.get(name));
+    pass.setBindGroup(0, this.groups[name]);
     if (size.indirect) pass.dispatchWorkgroupsIndirect(size.indirect, size.offset);
     else pass.dispatchWorkgroups(...size);
   }
@@ -68,7 +66,7 @@ export class Passes {
     this.count = meta.count;
     this.meta = meta;
     this.numbered = 0;
-    this.uniforms = new Map();
+    this.uniforms = {};
     this.room = 0;
     const n = this.count, words = 4 * n;
     this.geometry = this.buffer(packed.byteLength, packed);
@@ -99,11 +97,7 @@ export class Passes {
 
   /// A uniform of four whole numbers that never change.
   constant(...words) {
-    const key = words.join();
-    if (!this.uniforms.has(key)) {
-      this.uniforms.set(key, this.buffer(16, new Uint32Array(words), GPUBufferUsage.UNIFORM));
-    }
-    return this.uniforms.get(key);
+    return this.uniforms[words.join()] ??= this.buffer(16, new Uint32Array(words), GPUBufferUsage.UNIFORM);
   }
 
   get mostPairs() { return Math.floor(this.device.limits.maxStorageBufferBindingSize / 4); }
@@ -115,7 +109,7 @@ export class Passes {
     this.pairKeys = [this.buffer(4 * this.room), this.buffer(4 * this.room)];
     this.pairs = [this.buffer(4 * this.room), this.buffer(4 * this.room)];
     this.histogram = this.buffer(64 * (Math.ceil(Math.max(this.room, this.count) / SORT_BLOCK) + 1));
-    this.pipelines.groups.clear();
+    this.pipelines.groups = {};
   }
 
   indirect(offset) { return { indirect: this.arguments, offset }; }
