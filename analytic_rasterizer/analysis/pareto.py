@@ -379,36 +379,10 @@ def to_markdown(results: dict) -> str:
 def _plot(results: dict, at_scale: dict):
     """Accuracy over time, for both passes, with the front."""
     unit, key, factor = _time_unit(results)
-    rows = at_scale["methods"]
     figure, axes = tables.new_figure(13, 5.6, 2, sharey=True)
     for ax, (passes, title) in zip(axes[0], PASSES.items()):
-        times = {row["method"]: row[f"{passes}_{key}"] * factor for row in rows}
-        front = sorted((times[row["method"]], row["psnr"]) for row in rows if row[f"{passes}_front"])
-        wide = {"color": "#ffd43b", "linewidth": 5, "alpha": 0.7, "zorder": 1}
-        ax.plot(*zip(*front), drawstyle="steps-post", label="Pareto front", **wide)
-        for label, family in _families(rows).items():
-            style = tables.style(family[-1]["footprint"]) | {"linestyle": "-", "linewidth": 1, "markersize": 8}
-            if family[-1]["supersampling"] > 1:
-                style["marker"] = "X"
-            x, y = [times[row["method"]] for row in family], [row["psnr"] for row in family]
-            added = [row[f"{passes}_usual_{key}"] * factor - time for row, time in zip(family, x)]
-            ax.errorbar(x, y, xerr=[[0] * len(x), added], label=label, **style)
-            for row, *place in zip(family, x, y):
-                if not row["resolved"]:
-                    ax.plot(*place, **style, markerfacecolor="white")
-                samples = dict(resolve_footprint(row["footprint"]).options).get("samples", "")
-                text = samples if row["supersampling"] == 1 else "{0}x{0}".format(row["supersampling"])
-                ax.annotate(text, place, (0, 7), textcoords="offset points", fontsize=8, ha="center")
-        floor = next((row["blending_rmse"] for row in rows if row["blending_rmse"]), None)
-        if floor:
-            label = "floor of one exact weight"
-            ax.axhline(finite_decibels(floor**2), color="black", linewidth=0.9, linestyle=":", label=label)
-        if at_scale["order"] is not None:
-            label = "pictures in the order along rays"
-            ax.axhline(at_scale["order"]["psnr"], color="#868e96", linewidth=0.9, linestyle="--", label=label)
-        limit, top = finite_decibels(at_scale["reference"]["resolves_rmse_from"] ** 2), ax.get_ylim()[1]
-        if limit < top:
-            ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
+        _plot_methods(ax, at_scale["methods"], f"{passes}_front", f"{passes}_{key}", f"{passes}_usual_{key}", factor)
+        _plot_limits(ax, at_scale)
         ax.set_xlabel(f"{title} [{unit}]")
     axes[0, 0].set_ylabel("PSNR against the pixel integral [dB]")
     right = axes[0, 1].secondary_yaxis("right")
@@ -417,6 +391,41 @@ def _plot(results: dict, at_scale: dict):
     bars = f"; bars: from the fastest to the median of {results['rounds']} rounds" if key == "ratio" else ""
     tables.add_titles(figure, axes, f"{results['scene']} at {_scale_and_sizes(at_scale)} px: accuracy over time{bars}")
     return figure
+
+
+def _plot_methods(ax, rows: list[dict], front: str, time: str, usual: str, factor: float) -> None:
+    """Accuracy over time, a line per family of methods. `front`, `time` and `usual` are keys of rows; times get a
+    factor."""
+    fastest = sorted((row[time] * factor, row["psnr"]) for row in rows if row[front])
+    wide = {"color": "#ffd43b", "linewidth": 5, "alpha": 0.7, "zorder": 1}
+    ax.plot(*zip(*fastest), drawstyle="steps-post", label="Pareto front", **wide)
+    for label, family in _families(rows).items():
+        style = tables.style(family[-1]["footprint"]) | {"linestyle": "-", "linewidth": 1, "markersize": 8}
+        if family[-1]["supersampling"] > 1:
+            style["marker"] = "X"
+        x, y = [row[time] * factor for row in family], [row["psnr"] for row in family]
+        added = [row[usual] * factor - at for row, at in zip(family, x)]
+        ax.errorbar(x, y, xerr=[[0] * len(x), added], label=label, **style)
+        for row, *place in zip(family, x, y):
+            if not row["resolved"]:
+                ax.plot(*place, **style, markerfacecolor="white")
+            samples = dict(resolve_footprint(row["footprint"]).options).get("samples", "")
+            text = samples if row["supersampling"] == 1 else "{0}x{0}".format(row["supersampling"])
+            ax.annotate(text, place, (0, 7), textcoords="offset points", fontsize=8, ha="center")
+
+
+def _plot_limits(ax, at_scale: dict) -> None:
+    """Accuracies that no method here can exceed, or that the reference cannot tell apart."""
+    floor = next((row["blending_rmse"] for row in at_scale["methods"] if row["blending_rmse"]), None)
+    if floor:
+        label = "floor of one exact weight"
+        ax.axhline(finite_decibels(floor**2), color="black", linewidth=0.9, linestyle=":", label=label)
+    if at_scale["order"] is not None:
+        label = "pictures in the order along rays"
+        ax.axhline(at_scale["order"]["psnr"], color="#868e96", linewidth=0.9, linestyle="--", label=label)
+    limit, top = finite_decibels(at_scale["reference"]["resolves_rmse_from"] ** 2), ax.get_ylim()[1]
+    if limit < top:
+        ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
 
 
 def _families(rows: list[dict]) -> dict[str, list[dict]]:
