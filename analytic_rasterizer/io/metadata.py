@@ -113,13 +113,8 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
         elif words in (["antialiased", "0"], ["antialiased", "1"]):  # Postshot
             fields["antialiased"] = words[1] == "1"
         elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["order"], ["offset"], ["background"], ["axes"]):
-            _, name, *values = words
             try:
-                if name == "axes":  # of the file, and not of the scene
-                    checked_axes(" ".join(values))
-                    continue
-                value = " ".join(values) if name in ("footprint", "order") else tuple(map(float, values))
-                fields[name] = getattr(SceneMetadata(**{name: value}).checked(), name)
+                fields |= _own_field(*words[1:])
             except (ValueError, TypeError) as error:
                 warnings.warn(f"{where}: '{line}' is not understood ({first_line(error)})", stacklevel=3)
         else:
@@ -127,6 +122,18 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
     if "footprint" in fields:
         fields["antialiased"] = SceneMetadata(fields["footprint"]).checked().antialiased
     return SceneMetadata(**fields, comments=tuple(others))
+
+
+def _own_field(name: str, *words: str) -> dict[str, Any]:
+    """The field of `SceneMetadata` that a line of ours gives; none of axes, which are of the file and not of the scene.
+
+    Raises ValueError or TypeError for what makes no sense.
+    """
+    if name == "axes":
+        checked_axes(" ".join(words))
+        return {}
+    value = " ".join(words) if name in ("footprint", "order") else tuple(map(float, words))
+    return {name: getattr(SceneMetadata(**{name: value}).checked(), name)}
 
 
 def read_metadata(path) -> SceneMetadata:
