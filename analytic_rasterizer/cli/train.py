@@ -9,6 +9,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from .. import io
 from ..declared import declared
@@ -121,15 +122,61 @@ def run(args) -> None:
 
 def run_on(ranks: Ranks, args) -> bool:
     """`run`, on every rank. Returns whether the training came to its end."""
-    given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
-    if given.get("seconds") and "iterations" in given:
-        raise ValueError("--seconds is instead of --iterations: leave out one of them")
     if args.port is not None and not args.watch:
         raise ValueError("--port is for --watch")
     if args.watch and is_launched():
         raise ValueError("--watch is for one process, got torchrun")
     if args.watch:
         io.optional_import("viser", "view")  # raises before the pictures are read
+    asked = _asked_for(args)
+    age = process_age()  # most of it is the import of torch
+    began = time.perf_counter()
+    reading = {name: getattr(args, name) for name in READING}
+    scene = capture_of(args, ranks)
+    if scene != args.scene:
+        reading["images"] = None  # which said where the photographs are
+    seconds = time.perf_counter() - began
+    training = Run(
+        CaptureSource(scene, **reading, points=args.points),
+        args.out,
+        asked.options,
+        device=args.device,
+        save_every=args.save_every,
+        resume=args.resume,
+        **asked.length,
+        memory=PictureMemory(args.picture_memory_gpu, args.picture_memory_host),
+        tensorboard=args.tensorboard,
+        chosen=asked.chosen,
+        ranks=ranks,
+    )
+    if age is not None:
+        training.phases = {"start": age, **({"cameras": seconds} if scene != args.scene else {}), **training.phases}
+    for note in training.notes if ranks.is_first else ():
+        print(note, file=sys.stderr)
+    limit, found = training.options.gaussian_limit, training.points_found
+    if found is not None and found > limit and ranks.is_first:
+        print(f"starts from {limit:,} of {found:,} points, drawn at random (--max-gaussians)", file=sys.stderr)
+    with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
+        if viewer is not None:
+            print(f"watch at {viewer.url}", flush=True)
+        complete = training.train(viewer)
+        finish(training, complete, args)
+    return complete
+
+
+class Asked(NamedTuple):
+    """What the command line says of the training."""
+
+    options: TrainingOptions
+    length: dict[str, Any]  # of a training that is resumed: another length
+    chosen: list[str]  # names of the arguments that were given
+
+
+def _asked_for(args) -> Asked:
+    """What is asked for. Raises ValueError for what does not go together, or with the checkpoint to go on from."""
+    given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
+    if given.get("seconds") and "iterations" in given:
+        raise ValueError("--seconds is instead of --iterations: leave out one of them")
     checkpoint = Path(args.out) / CHECKPOINT
     chosen = [*given, *(name for name in ("images", "test_every") if getattr(args, name) is not None)]
     # Mapped: of a large file little is needed here.
@@ -152,39 +199,7 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
     if args.export and resolve_footprint((stored or options).footprint).name == DILATED:
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
-    age = process_age()  # most of it is the import of torch
-    began = time.perf_counter()
-    reading = {name: getattr(args, name) for name in READING}
-    scene = capture_of(args, ranks)
-    if scene != args.scene:
-        reading["images"] = None  # which said where the photographs are
-    seconds = time.perf_counter() - began
-    training = Run(
-        CaptureSource(scene, **reading, points=args.points),
-        args.out,
-        options,
-        device=args.device,
-        save_every=args.save_every,
-        resume=args.resume,
-        **length,
-        memory=PictureMemory(args.picture_memory_gpu, args.picture_memory_host),
-        tensorboard=args.tensorboard,
-        chosen=chosen,
-        ranks=ranks,
-    )
-    if age is not None:
-        training.phases = {"start": age, **({"cameras": seconds} if scene != args.scene else {}), **training.phases}
-    for note in training.notes if ranks.is_first else ():
-        print(note, file=sys.stderr)
-    limit, found = training.options.gaussian_limit, training.points_found
-    if found is not None and found > limit and ranks.is_first:
-        print(f"starts from {limit:,} of {found:,} points, drawn at random (--max-gaussians)", file=sys.stderr)
-    with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
-        if viewer is not None:
-            print(f"watch at {viewer.url}", flush=True)
-        complete = training.train(viewer)
-        finish(training, complete, args)
-    return complete
+    return Asked(options, length, chosen)
 
 
 def capture_of(args, ranks: Ranks) -> str | Path:
