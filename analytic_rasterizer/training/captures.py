@@ -180,16 +180,7 @@ def read_cameras(
     if not places and parts is not None:
         raise colmap.incomplete(parts)
     if not places:
-        below, pictures = reconstruction_below(folder), count_pictures(folder)
-        found = f", got {pictures} pictures without cameras" if pictures else ""
-        advice = "train SCENE --out DIR finds the cameras of photographs with COLMAP"
-        if below is not None:
-            advice = f"there is a reconstruction in {below} (--cameras {below}, --images FOLDER)"
-        raise io.SceneError(
-            f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
-            f"(.bin or .txt) in sparse/0{found}",
-            *([advice] if pictures or below is not None else []),
-        )
+        raise _no_cameras(folder)
     found, passed_over = {}, {}
     for place in places:
         try:
@@ -212,6 +203,22 @@ def read_cameras(
     errors = [*passed_over.values(), *([] if parts is None else [colmap.incomplete(parts)])]
     notes += [f"passed over: {error.message}" for error in errors]
     return found[chosen]._replace(notes=(*found[chosen].notes, *notes))
+
+
+def _no_cameras(folder: Path) -> io.SceneError:
+    """Of a folder in which nothing says where cameras are; advises what is there to go on with."""
+    below, pictures = reconstruction_below(folder), count_pictures(folder)
+    found = f", got {pictures} pictures without cameras" if pictures else ""
+    advice = []
+    if below is not None:
+        advice = [f"there is a reconstruction in {below} (--cameras {below}, --images FOLDER)"]
+    elif pictures:
+        advice = ["train SCENE --out DIR finds the cameras of photographs with COLMAP"]
+    return io.SceneError(
+        f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
+        f"(.bin or .txt) in sparse/0{found}",
+        *advice,
+    )
 
 
 def _without_missing(capture: Capture) -> Capture:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -24,7 +25,7 @@ from .depth import DepthMap, depth_planes
 from .parts import check_scales
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size, unreadable_pictures
 from .reduction import reduce, reduced_depths
-from .store import DEVICE, FILE, Key, Made, PictureMemory, Store, columns, free_memory, limits_of, plan_places
+from .store import DEVICE, FILE, Key, Made, PictureMemory, Plan, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens
 
 NAMED = 3  # files in a warning
@@ -151,40 +152,9 @@ def load_pictures(
     sizes, pixels = _sizes(shapes, scales, recipe, maps)
     free = free_memory(device)
     plan = plan_places(sizes, pixels, limits_of(memory, free, device), free, device, memory.processes)
-    views, settings, kept, sums = [], {scale: [] for scale in scales}, {}, {scale: [] for scale in scales}
-    to_turn, errors, shares = [], [], []
-    with closing(_read_ahead(items, maps, scales, plan.threads)) as ahead:
-        for number, (item, files) in enumerate(zip(items, ahead)):
-            if isinstance(files, io.SceneError):
-                errors.append(files)
-            if errors:  # the others are read to say how many there are
-                continue
-            if not files[1].header.tells_orientation(item.view):
-                to_turn.append(item.files[1])
-            view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
-            views.append(view)
-            mask = of_scales[min(scales)].mask
-            shares.append(1.0 if mask is None else mask.float().mean().item() / 255)
-            for scale in scales:
-                place = plan.places[scale, number]
-                if place != FILE:
-                    kept[scale, number] = of_scales[scale] if place == DEVICE else of_scales[scale].map(Tensor.cpu)
-                # In fractions: the cut makes both sizes multiples of the scale.
-                behind = (0.0, 0.0, 0.0) if background is None else background
-                settings[scale].append(view.settings(1 / scale, behind, device=device))
-                planes = of_scales[scale].depth
-                sums[scale].append(0.0 if planes is None else planes[1].float().sum().item())
-    if errors:
-        raise unreadable_pictures(errors, len(items))
+    found = _read_all(items, maps, scales, recipe, plan, device)
     warn_of_shapes(shapes)
-    if to_turn:
-        named = ", ".join(str(path) for path in to_turn[:NAMED])
-        warnings.warn(
-            f"EXIF says to turn or mirror {len(to_turn)} pictures, which are used as they are stored, as COLMAP does; "
-            f"cameras that were found for the turned pictures do not fit them: {named}"
-            + (", .." if len(to_turn) > NAMED else ""),
-            stacklevel=2,
-        )
+    _warn_of_turned(found.to_turn)
 
     def read(key: Key, pinned: Callable[[Tensor], Tensor]) -> dict[int, Stored]:
         files = _read_files(items[key[1]], key[:1], maps[key[1]])
@@ -193,15 +163,16 @@ def load_pictures(
     def make(key: Key, files: dict[int, Stored], moved: Callable[[Tensor], Tensor]) -> Made:
         return _make(items[key[1]], files, key[:1], recipe, moved)[1][key[0]]
 
-    store = Store(device, plan, kept, read, make)
+    store = Store(device, plan, found.kept, read, make)
     if plan.ahead:
         colors, masks, depths = columns(store, scales, len(items))
     else:
         colors, masks, depths = (
-            {scale: [kept[scale, i][k] for i in range(len(items))] for scale in scales}
+            {scale: [found.kept[scale, i][k] for i in range(len(items))] for scale in scales}
             for k in range(len(Made._fields))
         )
-    return Pictures(views, settings, colors, masks, store, shares, depths if any(maps) else None, sums)
+    depths = depths if any(maps) else None
+    return Pictures(found.views, found.settings, colors, masks, store, found.shares, depths, found.depth_sums)
 
 
 class Recipe(NamedTuple):
@@ -210,6 +181,64 @@ class Recipe(NamedTuple):
     multiple: int  # px, of their sizes at scale 1
     background: tuple[float, float, float] | None
     downsampling: str
+
+
+class _Read(NamedTuple):
+    """What reading every photograph once has found."""
+
+    views: list[io.View]  # this one and those without a comment as in `Pictures`
+    settings: dict[int, list[GaussianRasterizationSettings]]
+    shares: list[float]
+    depth_sums: dict[int, list[float]]
+    kept: dict[Key, Made]  # pictures that stay in memory
+    to_turn: list[Path]  # files that EXIF says to turn
+
+
+def _read_all(
+    items: list[Photograph],
+    maps: Sequence[DepthMap | None],
+    scales: tuple[int, ...],
+    recipe: Recipe,
+    plan: Plan,
+    device: torch.device,
+) -> _Read:
+    """Reads and makes all pictures. Raises io.SceneError, which says how many cannot be read."""
+    found = _Read([], {scale: [] for scale in scales}, [], {scale: [] for scale in scales}, {}, [])
+    background = io.BLACK if recipe.background is None else recipe.background
+    errors = []
+    with closing(_read_ahead(items, maps, scales, plan.threads)) as ahead:
+        for number, (item, files) in enumerate(zip(items, ahead)):
+            if isinstance(files, io.SceneError):
+                errors.append(files)
+            if errors:  # the others are read to say how many there are
+                continue
+            if not files[1].header.tells_orientation(item.view):
+                found.to_turn.append(item.files[1])
+            view, of_scales = _make(item, files, scales, recipe, lambda tensor: tensor.to(device))
+            found.views.append(view)
+            mask = of_scales[min(scales)].mask
+            found.shares.append(1.0 if mask is None else mask.float().mean().item() / 255)
+            for scale, made in of_scales.items():
+                place = plan.places[scale, number]
+                if place != FILE:
+                    found.kept[scale, number] = made if place == DEVICE else made.map(Tensor.cpu)
+                # In fractions: the cut makes both sizes multiples of the scale.
+                found.settings[scale].append(view.settings(1 / scale, background, device=device))
+                found.depth_sums[scale].append(0.0 if made.depth is None else made.depth[1].float().sum().item())
+    if errors:
+        raise unreadable_pictures(errors, len(items))
+    return found
+
+
+def _warn_of_turned(paths: list[Path]) -> None:
+    """Warns of pictures that EXIF says to turn, for who calls `load_pictures`."""
+    if paths:
+        named = ", ".join(map(str, paths[:NAMED])) + (", .." if len(paths) > NAMED else "")
+        warnings.warn(
+            f"EXIF says to turn or mirror {len(paths)} pictures, which are used as they are stored, as COLMAP does; "
+            f"cameras that were found for the turned pictures do not fit them: {named}",
+            stacklevel=3,
+        )
 
 
 def read_sizes(items: list[Photograph]) -> list[tuple[Photograph, Header]]:
