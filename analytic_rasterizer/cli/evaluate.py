@@ -29,7 +29,7 @@ from ..training.falloff import read_falloffs
 from ..training.files import EVALUATION, OPTIONS, SCENE, VIGNETTING, write_json
 from ..training.parts import check_scales
 from ..training.source import READING
-from ..training.start import background_of
+from ..training.start import background_shown
 from ..training.store import processes_here
 from .arguments import (
     add_machine_options,
@@ -194,7 +194,7 @@ def background_for(found: io.FoundScene, protocol: Protocol, capture: Capture, g
     if given is not None:
         return given
     if protocol.options is not None:
-        return background_of(protocol.options, capture.background) or capture.background
+        return background_shown(protocol.options, capture.background)
     return capture.background if found.background is None else found.background[0]
 
 

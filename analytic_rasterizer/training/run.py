@@ -46,7 +46,7 @@ from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
 from .source import CaptureSource
-from .start import background_of, begin, of_length
+from .start import background_of, background_shown, begin, of_length
 from .store import PictureMemory, processes_here
 from .trainer import Trainer
 
@@ -368,15 +368,14 @@ class Run:
             views=self.trainer.pictures.views,
             footprint=self.options.footprint,
             order=self.options.order,
-            background=background_of(self.options, self.capture.background) or self.capture.background,
+            background=background_shown(self.options, self.capture.background),
             name=Path(self.source["scene"]).name,
         )
 
     def describe(self) -> dict[str, Any]:
         """What options.json holds."""
         name = torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "CPU"
-        # What the scene is shown on: a random background is none.
-        background = background_of(self.options, self.capture.background) or self.capture.background
+        background = background_shown(self.options, self.capture.background)
         described = {"source": self.source, "background": list(background), "device": name}
         return described | {"torch": torch.__version__, "options": self.options.to_dict()}
 
@@ -416,8 +415,7 @@ class Run:
         metrics = self.summary()
         if self.capture.test:
             with self._phase("evaluate"):
-                # A random background has no truth of its own to test against: the convention's has.
-                background = background_of(self.options, self.capture.background) or self.capture.background
+                background = background_shown(self.options, self.capture.background)
                 memory = self.memory.less(self.trainer.pictures.store.plan, self.device)
                 pictures = self._load(self.capture.test, background, memory)
                 common = {"supersampling": self.options.supersampling, "ranks": self.ranks, "color_corrected": True}

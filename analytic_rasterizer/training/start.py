@@ -196,3 +196,8 @@ def background_of(options: TrainingOptions, convention: tuple[float, float, floa
     if options.background == RANDOM_BACKGROUND:
         return None
     return BACKGROUNDS.get(options.background, convention)
+
+
+def background_shown(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple[float, float, float]:
+    """What a scene is shown and tested on: in place of random colours, which have no truth, the convention's."""
+    return background_of(options, convention) or convention
