@@ -10,7 +10,7 @@
 // when it leaves.
 #pragma once
 
-#include "core/bin.h"
+#include "core/constants.h"
 #include "core/covariance_vjp.h"
 #include "core/rows.h"
 
@@ -120,16 +120,28 @@ AR_HD WindowEntry<V, kKept> exchange_nearest(WindowEntry<V, kKept>* slots, int c
 }
 
 /// Whether a splat whose samples move may show in a pixel: nodes stay within it, and move on before the splat leaves
-/// the window. `d`: pixel - mean.
+/// the window. Exact, with half of the slack of lists: all tiles that have the pixel list the splat. `d`: pixel - mean.
 template <class P, typename T> struct PixelReach {
   Mat2<T> w;
-  BoxReach<T> box;
+  T level;
+  Vec2<T> along;  ///< |w d| is least at d.x = along.x d.y of a row, and at d.y = along.y d.x of a column
 
   AR_HD static PixelReach of(const Splat<P, T>& splat) {
     const Mat2<T> w = P::ellipse(splat.shape);
-    return {w, make_box_reach(w, splat.level, {T(P::kReach), T(P::kReach)}, T(0))};
+    const T b = w.xx * w.xy + w.yx * w.yy;
+    return {w,
+            splat.level + T(0.5 * kLevelSlack),
+            {-quotient(b, w.xx * w.xx + w.yx * w.yx), -quotient(b, w.xy * w.xy + w.yy * w.yy)}};
   }
-  template <class V> AR_HD MaskOf<V> reaches(Vec2<V> d) const { return reaches_box(box, transform(w, d)); }
+  template <class V> AR_HD MaskOf<V> reaches(Vec2<V> d) const {
+    const V reach = V(T(P::kReach)), zero = V(T(0));
+    const Vec2<V> lo = {d.x - reach, d.y - reach}, hi = {d.x + reach, d.y + reach};
+    // The pixel's row and column next to the mean; one of them has the point that the ellipse reaches first.
+    const V x = min(max(zero, lo.x), hi.x), y = min(max(zero, lo.y), hi.y);
+    const V in_row = min(max(V(along.x) * y, lo.x), hi.x), in_column = min(max(V(along.y) * x, lo.y), hi.y);
+    const Vec2<V> a = transform(w, Vec2<V>{in_row, y}), b = transform(w, Vec2<V>{x, in_column});
+    return min(madd(a.x, a.x, a.y * a.y), madd(b.x, b.x, b.y * b.y)) <= V(level);
+  }
 };
 
 }  // namespace ar

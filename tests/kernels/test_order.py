@@ -303,12 +303,14 @@ def test_the_same_bits_in_every_run(device, variant):
         assert all(torch.equal(a, b) for a, b in zip(found[0], others))
 
 
-def test_pictures_do_not_depend_on_where_tiles_are():
-    """A picture cut out of a larger one, by other tiles."""
+@each_along_rays
+def test_pictures_do_not_depend_on_where_tiles_are(variant, with_window):
+    """A picture cut out of a larger one, by other tiles, with a window that many pixels fill."""
+    with_window(5)
     camera = Camera(image_height=64, image_width=80)
     scene = tilted_scene(15, 200)
     scene["means3D"] = 0.5 * scene["means3D"]  # not beyond the clamp of the smaller picture
-    whole = camera.render(scene, ("box", {"samples": 1}), effects=RAYS)[0]
+    whole = camera.render(scene, variant, effects=RAYS)[0]
     x, y, width, height = 7, 5, 61, 40
     part = camera.__class__(
         image_height=height,
@@ -317,7 +319,7 @@ def test_pictures_do_not_depend_on_where_tiles_are():
         tanfovy=camera.tanfovy * height / 64,
         shift=(40 - width / 2 - x, 32 - height / 2 - y),
     )
-    cut = part.render(scene, ("box", {"samples": 1}), effects=RAYS)[0]
+    cut = part.render(scene, variant, effects=RAYS)[0]
     assert whole.max() > 0.3
     assert (cut - whole[:, y : y + height, x : x + width]).abs().max() < 1e-9
 

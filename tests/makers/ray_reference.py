@@ -12,7 +12,7 @@ import reference
 import torch
 
 RAY_VARIANCE = 1e-4  # px^2
-LEVEL_SLACK = 1e-2
+LEVEL_SLACK = 5e-3
 SMALLEST_SCALE = 1e-3  # of the largest of a Gaussian: a flatter one has no depth along a ray in its plane
 
 
@@ -63,16 +63,27 @@ def linear_depths(settings, means, covariance, projection):
 
 
 def may_show(offset, cov2d, opacity, samples):
-    """(H, W) bool: whether `moment` may show a splat in a pixel, in which its nodes may be anywhere."""
+    """(H, W) bool: whether `moment` may show a splat in a pixel, in which its nodes may be anywhere.
+
+    The Mahalanobis distance of the pixel's nearest point, which is the mean, or on an edge.
+    """
     xx, xy, yy = reference.add_variance(cov2d, 1 / (12 * samples)).tolist()
-    wide_x, det = xx >= yy, xx * yy - xy * xy
-    wide, x, y = (xx, *offset.unbind(-1)) if wide_x else (yy, *offset.flip(-1).unbind(-1))
-    across, ratio = math.sqrt(wide / det), xy / wide
-    amplitude = math.sqrt(max(reference.determinant(cov2d).item(), 0) / det)
-    level = 2 * math.log(255 * opacity * amplitude) + LEVEL_SLACK
-    along, beside = x.abs() / math.sqrt(wide), across * (y - ratio * x).abs()
-    outside = (along - 0.5 / math.sqrt(wide)).clamp_min(0) ** 2
-    return outside + (beside - 0.5 * across * (1 + abs(ratio))).clamp_min(0) ** 2 <= level
+    det = xx * yy - xy * xy
+    peak = opacity * math.sqrt(max(reference.determinant(cov2d).item(), 0) / det)
+    if peak <= reference.ALPHA_MIN:  # nowhere
+        return torch.zeros(offset.shape[:-1], dtype=torch.bool)
+    level = 2 * math.log(peak / reference.ALPHA_MIN) + LEVEL_SLACK
+
+    def nearest(fixed, free, of_fixed, of_free):
+        """Least distance in which one coordinate is `fixed` and the other within a half of `free`."""
+        best = xy / of_fixed * fixed  # the mean of the free one, given the fixed one
+        best = torch.minimum(torch.maximum(best, free - 0.5), free + 0.5)
+        return (of_free * fixed**2 - 2 * xy * fixed * best + of_fixed * best**2) / det
+
+    x, y = offset.unbind(-1)
+    edges = [nearest(x + side, y, xx, yy) for side in (-0.5, 0.5)]
+    edges += [nearest(y + side, x, yy, xx) for side in (-0.5, 0.5)]
+    return (torch.stack(edges).amin(0) <= level) | (torch.maximum(x.abs(), y.abs()) <= 0.5)
 
 
 def leaving(depths, window):
