@@ -29,7 +29,8 @@ from ..footprints import (
 )
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
-from ..render.order import CENTER, RAY
+from ..render.order import RAY
+from ..render.seam import has_seam
 from . import tables, timing
 from .orders import OrderDifference
 from .reference import RMSE_SHARE, Refined, finite_decibels, image_errors, refine, supersampled
@@ -212,10 +213,11 @@ def _measure(
 def _order_difference(scene: Gaussians, views: list[View], background) -> dict | None:
     """How far pictures of BASE in the order of centres, which all methods and the reference have, are from those along
     rays (`OrderDifference`); None where these cannot be rendered."""
-    if scene.means.is_cuda:
+    centers = [timing.Case(scene, view, BASE, 1, background) for view in views]
+    if any(has_seam(case.settings) for case in centers):
         return None
-    cases = ([timing.Case(scene, view, BASE, 1, background, order) for order in (CENTER, RAY)] for view in views)
-    return asdict(OrderDifference.of([[case.forward() for case in pair] for pair in cases]))
+    rays = [timing.Case(scene, view, BASE, 1, background, RAY) for view in views]
+    return asdict(OrderDifference.of([[case.forward() for case in pair] for pair in zip(centers, rays)]))
 
 
 def _describe_reference(refined: Refined, sample: Callable[..., dict]) -> dict:

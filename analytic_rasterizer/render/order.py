@@ -16,9 +16,10 @@ ORDERS = tuple(WINDOWS)
 
 
 def check_order(order: str) -> None:
-    """Raises ValueError unless it is one of `ORDERS`."""
-    if order not in ORDERS:
-        raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}")
+    """Raises TypeError unless it is a string, and ValueError unless it is one of `ORDERS`."""
+    if not isinstance(order, str) or order not in ORDERS:
+        error = ValueError if isinstance(order, str) else TypeError
+        raise error(f"order must be one of {', '.join(ORDERS)}, got {order!r}")
 
 
 def footprints_along_rays() -> tuple[str, ...]:

@@ -112,6 +112,7 @@ class LiveViewer:
 
         Raises:
             ImportError: viser is missing; names the extra that installs it.
+            TypeError: An order that is not a string.
             ValueError: A port that cannot be used, or a bad footprint, background, interval or order.
             RuntimeError: A version of viser that cannot be given an access check.
         """

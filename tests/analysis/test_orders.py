@@ -1,6 +1,7 @@
 """How far pictures in two orders are apart, and what `inspect` and `pareto` say of it."""
 
 import math
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from gaussians import of_inputs
 from scenes import Camera
 
 import analytic_rasterizer as ar
+from analytic_rasterizer.analysis import pareto
 from analytic_rasterizer.analysis.orders import OrderDifference
 
 
@@ -57,6 +59,21 @@ def test_inspect_says_whether_the_order_matters(angle, needed):
     assert f"{expected.psnr:.1f} dB from those along rays" in found.reason
     assert f"{100 * expected.share:.1f}% of their pixels differ by more than 1/255" in found.reason
     assert report.effects.order == "center"  # an advice, and nothing that the footprints were measured with
+
+
+def test_pareto_says_how_far_the_orders_are_apart(device):
+    """Of the same pictures as `inspect`; None for views of the whole sphere."""
+    scene, size = plates(math.pi / 4).to(device), {"width": 32, "height": 16, "fx": 30, "fy": 30}
+    view = ar.View("one", **size, w2c=torch.eye(4, dtype=torch.float64))
+    pictures = []
+    for order in ("center", "ray"):
+        settings = view.settings(sh_degree=0, footprint="box:samples=1", device=device, effects=ar.Effects(order=order))
+        pictures.append(ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())[0])
+    found = pareto._order_difference(scene, [view, view], (0.0, 0.0, 0.0))
+    assert found == asdict(OrderDifference.of([pictures, pictures])) and found["share"] > 0
+    assert (
+        pareto._order_difference(scene, [view, replace(view, lens=ar.Lens.equirectangular())], (0.0, 0.0, 0.0)) is None
+    )
 
 
 def test_inspect_where_the_order_cannot_be_rendered():

@@ -33,6 +33,9 @@ def test_names():
     assert ar.Effects() != RAYS
     with pytest.raises(ValueError, match="order must be one of center, ray, ray:32, got 'z'"):
         ar.Effects(order="z")
+    for wrong in (None, 24, ["ray"], torch.zeros(2)):
+        with pytest.raises(TypeError, match="order must be one of center, ray, ray:32, got "):
+            ar.Effects(order=wrong)
     for name in ("median_depth", "dominant_index", "gaussian_stats"):
         with pytest.raises(ValueError, match=f"{name} must be False with order 'ray'"):
             ar.Effects(order=RAY, **{name: True})
