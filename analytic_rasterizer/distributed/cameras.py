@@ -23,6 +23,7 @@ import torch.distributed as dist
 from ..checks import check_tensors
 from ..render.autocast import way_out_of, widened, widened_settings
 from ..render.effects import AUTO
+from ..render.order import CENTER
 from ..render.seam import has_seam
 from ..render.settings import GaussianRasterizationSettings
 from ..render.stages import Splats, blend, list_tiles, project
@@ -251,6 +252,9 @@ def check_camera(settings: GaussianRasterizationSettings, name: str = "") -> Non
         raise ValueError(f"lens must not be equirectangular, which is not distributed, got it{name}")
     if isinstance(settings.effects, str) and settings.effects == AUTO:
         raise ValueError(f'effects must not be "auto", which looks at all Gaussians, got it{name}')
+    order = getattr(settings.effects, "order", CENTER)
+    if order != CENTER:  # rows that are sent have no slopes
+        raise ValueError(f"order must be {CENTER!r} where Gaussians are distributed, got {order!r}{name}")
 
 
 def check_colors(shs: Any, colors_precomp: Any) -> None:

@@ -103,6 +103,12 @@ def of_one_process(footprint, dtype, rows):
     return made
 
 
+def band_along_rays():
+    """Slopes of splats are not sent: a band of others would be a wrong picture."""
+    settings = settings_of(FOOTPRINTS[0], torch.float32)._replace(effects=ar.Effects(order="ray"))
+    return error_of(lambda: distributed.rasterize_bands(settings, **scene_of(torch.float32, "cpu")))
+
+
 def band_mistake(rank):
     bad = {"means3D": torch.zeros(5, 2), "opacities": torch.zeros(5), "shs": torch.zeros(5, 1, 3)}
     scene = bad if rank == 1 else scene_of(torch.float32, "cpu")
@@ -194,7 +200,7 @@ def work(rank, folder):
             scene = rows_of(gaussians_of(variant), SHARDS[world], rank)
             made[variant] = gsplat_of(variant, scene, cameras, {"distributed": True})
         if world == 2:
-            made["mistakes"] = gsplat_mistakes(rank) | {"bands": band_mistake(rank)}
+            made["mistakes"] = gsplat_mistakes(rank) | {"bands": band_mistake(rank), "order": band_along_rays()}
         torch.save(made, f"{folder}/{world}-{rank}.pt")
         dist.destroy_process_group()
 
@@ -374,6 +380,7 @@ MISTAKES = {
     "refused": ("RuntimeError", "on rank 1: sparse_grad is not supported: gradients are dense tensors"),
     "batch": ("ValueError", "on rank 1: means must have no leading dimensions where distributed is True, got (1,)"),
     "bands": ("ValueError", "on rank 1: means3D must have shape (P, 3), got (5, 2)"),
+    "order": ("ValueError", "on rank 0: order must be 'center' where Gaussians are distributed, got 'ray'"),
 }
 
 
