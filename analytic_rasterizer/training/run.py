@@ -18,6 +18,7 @@ from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
+from ..render.order import CENTER
 from .automatic import LEARNED_ALONE, Settled, said_first, settle, start_corrections
 from .captures import Photograph
 from .depth_targets import depths_of
@@ -128,9 +129,10 @@ class Run:
             stored = TrainingOptions.from_dict(state["options"])
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
-        for name in (*LEARNED_ALONE, "depth"):
-            if ranks.world > 1 and getattr(self.options, name) != "none":
-                raise ValueError(f"{name} must be none for {ranks.world} processes, got {getattr(self.options, name)}")
+        for name, value in (dict.fromkeys((*LEARNED_ALONE, "depth"), "none") | {"order": CENTER}).items():
+            given = getattr(self.options, name)
+            if ranks.world > 1 and given != value:
+                raise ValueError(f"{name} must be {value} for {ranks.world} processes, got {given}")
         if tensorboard:
             io.optional_import("tensorboard", "tensorboard")  # raises before the capture is looked at
         self.phases = dict.fromkeys(("look", "load", "warm up", "steps", "write", "evaluate"), 0.0)

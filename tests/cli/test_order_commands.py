@@ -11,6 +11,7 @@ from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, training
+from analytic_rasterizer.distributed.ranks import Ranks
 from analytic_rasterizer.render.order import CENTER, RAY
 from analytic_rasterizer.training import files
 
@@ -81,6 +82,14 @@ def test_what_cannot_be_combined_is_refused(trained, tmp_path, capsys):
         training.TrainingOptions(order=RAY, footprint="box:samples=16")
     with pytest.raises(ValueError, match="order must be one of center, ray, ray:32, got last"):
         training.TrainingOptions(order="last")
+
+
+def test_several_processes_are_refused(synthetic, tmp_path):
+    """Before anything is read or written."""
+    options = training.TrainingOptions(order=RAY, footprint="box:samples=1")
+    with pytest.raises(ValueError, match="order must be center for 2 processes, got ray"):
+        training.Run(synthetic, tmp_path / "out", options, ranks=Ranks(world=2))
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_page_says_what_it_does_not_draw(trained, tmp_path, capsys):
