@@ -15,12 +15,6 @@ namespace {
 
 constexpr int kWidth = 4 * kTile - 3, kHeight = 3 * kTile - 5, kPixels = kWidth * kHeight;
 
-std::vector<float> random_numbers(std::mt19937& bits, size_t count, float low, float high) {
-  std::vector<float> numbers(count);
-  for (float& x : numbers) x = uniform(bits, low, high);
-  return numbers;
-}
-
 /// The footprint that is projected for pixels of F.
 template <class F> struct ProjectedFor {
   using Footprint = F;

@@ -15,35 +15,16 @@ namespace {
 
 constexpr int kWidth = 20, kHeight = 10, kPixels = kWidth * kHeight;
 
-/// A random scene, all of whose splats every tile lists.
-template <class F> struct Scene {
+template <class F> struct Scene : ListedScene<F> {
   static constexpr TileGrid kGrid = grid_for<F>(kWidth, kHeight);
-  int channels;
-  std::vector<Splat<F, float>> splats;
-  std::vector<SlotPair> pairs;
-  std::vector<int64_t> offsets = {0};
-  std::vector<float> rows, background, dL_dimage, dL_dalpha;
-  Counts counts = {};
 
   /// `largest`: logarithm of the largest variance.
-  Scene(int count, int channels, float most_opaque, float largest = 2) : channels(channels) {
+  Scene(int count, int channels, float most_opaque, float largest = 2) {
     std::mt19937 bits(7);
-    const auto fill = [&](std::vector<float>& to, int size, float low, float high) {
-      to.resize(size);
-      for (float& x : to) x = uniform(bits, low, high);
-    };
-    splats = random_splats<F>(bits, count, kGrid, -1, largest, most_opaque, [](const Cov2d<float>& cov) {
+    this->splats = random_splats<F>(bits, count, kGrid, -1, largest, most_opaque, [](const Cov2d<float>& cov) {
       return GaussianFootprint<kPixelSamples<F>, true>::prepare_with(cov, 1 / 12.0f);
     });
-    fill(rows, count * channels, 0, 1);
-    fill(background, channels, 0, 1);
-    fill(dL_dimage, channels * kPixels, -0.5f, 0.5f);
-    fill(dL_dalpha, kPixels, -0.5f, 0.5f);
-    for (int tile = 0; tile < kGrid.tiles(); ++tile) {
-      for (int k = 0; k < count; ++k) pairs.push_back({k, int32_t(pairs.size())});
-      offsets.push_back(int64_t(pairs.size()));
-    }
-    counts = {int64_t(pairs.size()), count};
+    this->complete(bits, channels, kGrid);
   }
 };
 

@@ -61,6 +61,37 @@ std::vector<Splat<F, float>> random_splats(std::mt19937& bits, int count, TileGr
   return splats;
 }
 
+inline std::vector<float> random_numbers(std::mt19937& bits, size_t count, float low, float high) {
+  std::vector<float> numbers(count);
+  for (float& x : numbers) x = uniform(bits, low, high);
+  return numbers;
+}
+
+/// Splats that every tile lists, with rows of channels, and gradients of their image.
+template <class F> struct ListedScene {
+  int channels = 0;
+  std::vector<Splat<F, float>> splats;
+  std::vector<SlotPair> pairs;
+  std::vector<int64_t> offsets = {0};
+  std::vector<float> rows, background, dL_dimage, dL_dalpha;
+  Counts counts = {};
+
+  /// Lists the splats, and draws all else.
+  void complete(std::mt19937& bits, int of_channels, TileGrid grid) {
+    const size_t count = splats.size(), pixels = size_t(grid.width) * size_t(grid.height);
+    channels = of_channels;
+    rows = random_numbers(bits, count * size_t(channels), 0, 1);
+    background = random_numbers(bits, size_t(channels), 0, 1);
+    dL_dimage = random_numbers(bits, size_t(channels) * pixels, -0.5f, 0.5f);
+    dL_dalpha = random_numbers(bits, pixels, -0.5f, 0.5f);
+    for (int tile = 0; tile < grid.tiles(); ++tile) {
+      for (int k = 0; k < int(count); ++k) pairs.push_back({k, int32_t(pairs.size())});
+      offsets.push_back(int64_t(pairs.size()));
+    }
+    counts.pairs = int64_t(pairs.size()), counts.splats = int(count);
+  }
+};
+
 /// Lists of pairs that lie tile by tile: splats, or splats with slots. They point into what is given.
 template <class Pair>
 TileLists lists_of(const std::vector<Pair>& pairs, const std::vector<int64_t>& tile_offsets, const Counts& counts) {

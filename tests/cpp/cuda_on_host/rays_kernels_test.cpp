@@ -17,24 +17,13 @@ namespace {
 
 constexpr int kWidth = 21, kHeight = 13, kPixels = kWidth * kHeight;
 
-/// A random scene, all of whose splats every tile lists.
-template <class F> struct Scene {
+template <class F> struct Scene : ListedScene<F> {
   static constexpr TileGrid kGrid = {kWidth, kHeight, kRayTileBits};
-  int channels;
-  std::vector<Splat<F, float>> splats;
   std::vector<RayDepth<float>> depths;
-  std::vector<SlotPair> pairs;
-  std::vector<int64_t> offsets = {0};
-  std::vector<float> rows, background, dL_dimage, dL_dalpha;
-  Counts counts = {};
 
-  Scene(int count, int channels, float most_opaque) : channels(channels) {
+  Scene(int count, int channels, float most_opaque) {
     std::mt19937 bits(7);
-    const auto fill = [&](std::vector<float>& to, int size, float low, float high) {
-      to.resize(size);
-      for (float& x : to) x = uniform(bits, low, high);
-    };
-    splats = random_splats<F>(bits, count, kGrid, -1, 3, most_opaque, [](const Cov2d<float>& cov) {
+    this->splats = random_splats<F>(bits, count, kGrid, -1, 3, most_opaque, [](const Cov2d<float>& cov) {
       if constexpr (std::is_same_v<F, Analytic<FrameGradient::kFrozen>> || F::kMoves) {
         return F::prepare(cov, FootprintOptions{0});
       } else {
@@ -46,17 +35,11 @@ template <class F> struct Scene {
       depths.push_back(k % 5 == 1 ? depths.back()
                                   : RayDepth<float>{0.05f * float(k) + uniform(bits, 0, 1),
                                                     {uniform(bits, -0.1f, 0.1f), uniform(bits, -0.1f, 0.1f)}});
-    fill(rows, count * channels, 0, 1);
-    fill(background, channels, 0, 1);
-    fill(dL_dimage, channels * kPixels, -0.5f, 0.5f);
-    fill(dL_dalpha, kPixels, -0.5f, 0.5f);
-    for (int tile = 0; tile < kGrid.tiles(); ++tile) {
-      for (int k = 0; k < count; ++k) pairs.push_back({k, int32_t(pairs.size())});
-      offsets.push_back(int64_t(pairs.size()));
-    }
-    counts.pairs = int64_t(pairs.size()), counts.splats = count;
+    this->complete(bits, channels, kGrid);
   }
-  const float* row(int splat) const { return channels == 3 ? &splats[splat].color.x : rows.data() + splat * channels; }
+  const float* row(int splat) const {
+    return this->channels == 3 ? &this->splats[splat].color.x : this->rows.data() + splat * this->channels;
+  }
 };
 
 /// Sums are those of splats: over their pairs.
