@@ -1,4 +1,4 @@
-// For tests: what launch() calls while torch/kernels_cuda.cpp records kernels.
+// For tests: what launch() calls while torch/for_tests_cuda.cpp records kernels.
 #pragma once
 
 #include <atomic>
