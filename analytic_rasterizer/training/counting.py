@@ -5,32 +5,18 @@ Nothing ever moves them, so that they would stay as fog beside what is trained.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..density import FixedDensity
-from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
+from .health import Trainer
 from .options import TrainingOptions
 from .pictures import Pictures
-from .schedule import Progress
 
 COUNTED = "counted"  # the rows among `FixedDensity.extra`
-
-
-class Trainer(Protocol):
-    """What is looked at here of a `training.Trainer`."""
-
-    options: TrainingOptions
-    ranks: Ranks
-    density: FixedDensity
-    progress: Progress
-    gaussians: Gaussians
-    count: int
-
-    def keep(self, kept: Tensor) -> None: ...
 
 
 class Counting:

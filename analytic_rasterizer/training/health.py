@@ -36,7 +36,7 @@ OPTION_OF = {
 
 
 class Trainer(Protocol):
-    """What is looked at here of a `training.Trainer`."""
+    """What checks during a training look at of a `training.Trainer`."""
 
     options: TrainingOptions
     pictures: Pictures
