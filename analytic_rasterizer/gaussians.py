@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from . import _C
 from .activations import activate
 from .checks import check_tensors, check_value, plain_value
 
@@ -166,7 +167,14 @@ class Gaussians(NamedTuple):
         )
 
     def with_sh_degree(self, degree: int) -> Gaussians:
-        """The same with harmonics of another degree: cut, or filled with zeros."""
+        """The same with harmonics of another degree, 0 to 4: cut, or filled with zeros.
+
+        Raises:
+            TypeError: No whole number.
+            ValueError: Another degree.
+        """
+        degree = plain_value("degree", degree, int)
+        check_value("degree", 0 <= degree <= _C.MAX_SH_DEGREE, f"0 to {_C.MAX_SH_DEGREE}", degree)
         wanted = (degree + 1) ** 2
         kept = self.shs[:, :wanted]
         return self._replace(shs=torch.cat([kept, kept.new_zeros(self.count, wanted - kept.shape[1], 3)], dim=1))

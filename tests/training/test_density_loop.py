@@ -378,6 +378,17 @@ def test_points_that_make_no_gaussians(wrong, error, message):
         ar.Gaussians.from_points(**arguments)
 
 
+def test_harmonics_of_another_degree():
+    made = ar.Gaussians.from_points(torch.rand(5, 3), sh_degree=1)
+    made = made._replace(shs=torch.rand(5, 4, 3))
+    assert made.with_sh_degree(0).shs.equal(made.shs[:, :1]) and made.with_sh_degree(1).shs.equal(made.shs)
+    most = made.with_sh_degree(4).shs
+    assert most.shape == (5, 25, 3) and most[:, :4].equal(made.shs) and not most[:, 4:].any()
+    for wrong, error, message in ((5, ValueError, "must be 0 to 4, got 5"), ("3", TypeError, "must be a whole number")):
+        with pytest.raises(error, match=f"degree {message}"):
+            made.with_sh_degree(wrong)
+
+
 # ----------------------------------------------------------------------- the example, the page
 
 
