@@ -55,7 +55,11 @@ def _value_of(text: str) -> int | str:
 
 
 def option_values(name: str) -> tuple:
-    """The values that the option of a footprint may have; empty where it is a number, or where there is no option."""
+    """The values that the option of a footprint may have; empty where it is a number, or where there is no option.
+
+    Raises:
+        KeyError: `name` is none of `FOOTPRINTS`.
+    """
     return tuple(_value_of(v["value"]) for v in _VARIANTS[name] if v["value"] is not None)
 
 

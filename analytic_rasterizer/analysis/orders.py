@@ -28,7 +28,7 @@ class OrderDifference:
 
     @classmethod
     def of(cls, pairs: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> OrderDifference:
-        """Of pictures (3, H, W) in both orders."""
+        """Of at least one pair of pictures (3, H, W) of floats in both orders, of any sizes. Waits for the device."""
         differences = [(one.double() - other).abs() for one, other in pairs]
         mean = sum(d.square().sum().item() for d in differences) / sum(d.numel() for d in differences)
         seen = sum((d.amax(0) > VISIBLE).sum().item() for d in differences)

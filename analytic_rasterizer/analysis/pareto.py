@@ -368,7 +368,7 @@ def _scale_and_sizes(at_scale: dict) -> str:
 
 
 def to_markdown(results: dict) -> str:
-    """All tables."""
+    """All tables of the results of `run`, as Markdown."""
     degree = results["sh_degree"]
     parts = [f"{results['scene']}: {results['gaussians']} Gaussians of SH degree {degree}. {results['machine']}."]
     for at_scale in results["scales"]:

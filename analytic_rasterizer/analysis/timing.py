@@ -195,7 +195,7 @@ def seconds_of(call: Callable[[], object], clock: Callable[[], float] = time.per
 
 
 def event_seconds(call: Callable[[], object], queued: bool = False) -> float:
-    """Time on the CUDA device from before a call to after it.
+    """Seconds on the CUDA device from before a call to after it. Waits for the device.
 
     With `queued` the device is kept busy until the host has launched the call, so that the host's time does not count;
     but what a call launches after it has itself waited for the device is not queued.

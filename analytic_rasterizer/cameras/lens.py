@@ -143,7 +143,10 @@ class Lens:
         return self.model in (*WIDE, SPHERE)
 
     def depths(self, points: torch.Tensor) -> torch.Tensor:
-        """(N,) depths, as of `Effects.lens`, of points (N, 3) in the camera's frame, world units."""
+        """(N,) depths, as of `Effects.lens`, of points (N, 3) in the camera's frame, world units.
+
+        Of the dtype and device of the points, differentiable.
+        """
         return points.norm(dim=1) if self.orders_by_distance else points[:, 2]
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -213,6 +216,8 @@ class Lens:
             tangents: tanfovx and tanfovy of the settings; numbers or tensors.
             center: x/z and y/z of a pinhole at the middle of the picture; numbers or tensors.
             height: Of the picture, px; `equirectangular` needs it.
+
+        Waits for the device of tensors.
         """
         if self.reach is not None:
             return self

@@ -44,15 +44,17 @@ LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is 
 
 
 def load_scene(path, strict: bool = False, axes: str | None = None) -> Gaussians:
-    """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic), a .splat
-    a glTF (.glb, .gltf), or OpenUSD with Gaussians (.usd, .usda, .usdc, .usdz).
+    """Reads a scene from a file of one of these formats.
+
+    A 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic), a .splat, a glTF (.glb, .gltf), or OpenUSD
+    with Gaussians (.usd, .usda, .usdc, .usdz).
 
     A .ply may be text or have either byte order, any types, and any other elements and properties. Red, green and blue
     are read where there are no harmonics, as those of degree 0.
 
     Gaussians that have a number that is not finite are left out, and a warning counts them. Another warning says where
-    positions of double precision lose what matters in float32. The axes of the result are
-    RDF: x right, y down, z forward (see `read_axes`).
+    positions of double precision lose what matters in float32. The axes of the result are RDF: x right, y down,
+    z forward (see `read_axes`).
 
     Args:
         path: The file. Its suffix, in any case, says which format it has.

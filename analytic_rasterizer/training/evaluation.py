@@ -32,9 +32,12 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8.
+    """() peak signal-to-noise ratio, dB, of two images (C, H, W); of equal ones it is infinite.
 
-    With a mask (H, W) in [0, 1] the error of each pixel counts by it; NaN where nothing counts.
+    Args:
+        image: Floats, which are clamped to [0, 1].
+        target: In [0, 1], of the same dtype, or uint8, which is read as target / 255.
+        mask: (H, W) in [0, 1]: the error of each pixel counts by it, and NaN is returned where nothing counts.
     """
     if target.dtype == torch.uint8:
         target = target.to(image.dtype) / 255
