@@ -241,7 +241,8 @@ def add_reading(parser, folder: str, training: str = "") -> None:
     add("--cameras", metavar="NAME", help=f"{cameras} (default: {training}found)")
     choices = {
         "lens": "photographs with a lens are rendered with it, resampled to pinholes, or an error",
-        "missing": "pictures and masks that cannot be read are an error, or left out: without its picture a camera too",
+        "missing": "pictures, masks and depth maps that cannot be read are an error, or left out: without its picture "
+        "a camera too",
         "masks": "black pixels of masks do not count, or masks are ignored",
         "alpha": "a background is seen through transparent pixels, or they do not count",
     }

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .. import io
-from .depth_files import DepthFile, read_depth
+from .depth_files import PARAMETERS, DepthFile, read_depth
 from .evidence import in_front
 from .layouts import Photograph
 
@@ -69,8 +69,9 @@ class Measured(NamedTuple):
 
 
 MISSING, BROKEN, EMPTY = "are missing", "cannot be used", "hold no depth anywhere"
-UNSCALED, WRONG = "have no scale, and too few points to find it", "do not fit the points"
+UNSCALED, WRONG = "have no scale", "do not fit the points"
 PROBLEMS = (MISSING, BROKEN, EMPTY, UNSCALED, WRONG)
+OF_FILES = PROBLEMS[:3]  # those of the files alone, whatever the points are
 
 
 def seen_points(view: io.View, points: Tensor, rows: Tensor | None) -> SeenPoints:
@@ -122,8 +123,9 @@ def measure_maps(
             return Measured(None)
         if unit is not None and not file.is_inverse:
             file = file._replace(scale=1 / unit)
-        if not file.path.is_file():
-            return Measured(None, MISSING, str(file.path))
+        absent = [path for path in (file.path, file.confidence) if path is not None and not path.is_file()]
+        if absent:
+            return Measured(None, MISSING, str(absent[0]))
         try:
             return _measured(file, item.view, points_in([item.view], points, tracks)[0], fit)
         except io.SceneError as error:
@@ -136,7 +138,7 @@ def measure_maps(
 def _measured(file: DepthFile, view: io.View, seen: SeenPoints, fit: bool) -> Measured:
     """Of a map that is there. Raises io.SceneError."""
     raw, shares = read_depth(file, view)
-    if not shares.any():
+    if not (raw * shares).any():
         return Measured(None, EMPTY, str(file.path))
     height, width = raw.shape
     column, row = (seen.pixels * seen.pixels.new_tensor([width / view.width, height / view.height])).long().unbind(1)
@@ -146,17 +148,19 @@ def _measured(file: DepthFile, view: io.View, seen: SeenPoints, fit: bool) -> Me
     enough = len(inverse) >= LEAST_POINTS
     found = fitted_scale(at_points, inverse) if fit and enough else None
     if fit and enough and found is None:
-        return Measured(None, WRONG, f"{file.path} is far where they are near")
+        return Measured(None, WRONG, f"{file.path}: far where they are near")
     if found is not None:
         file = file._replace(scale=found[0], shift=found[1])
     if file.scale is None:
-        return Measured(None, UNSCALED, str(file.path))
+        about = f"{file.path}: expected its scale in {PARAMETERS}"
+        about += f", or {LEAST_POINTS} points in it, got {len(inverse)}" if fit else " (--depth-fit none)"
+        return Measured(None, UNSCALED, about)
     difference = None
     if enough:
         difference = ((file.scale * at_points + file.shift - inverse).abs() / inverse).median().item()
         spread = ((inverse - inverse.median()).abs() / inverse).median().item()
         if not difference <= min(APART, max(UNLIKE, UNLIKE_SHARE * spread)):
-            return Measured(None, WRONG, f"{file.path} by {difference:.0%}", difference, found is not None)
+            return Measured(None, WRONG, f"{file.path}: by {difference:.0%}", difference, found is not None)
     depths = file.scale * raw[shares > 0].double() + file.shift
     if not (depths > 0).any():
         return Measured(None, EMPTY, str(file.path))

@@ -134,11 +134,10 @@ def read_depth(file: DepthFile, view: io.View) -> tuple[Tensor, Tensor]:
 def _read_png(path: Path) -> np.ndarray:
     """(h, w) float64 of a picture of whole numbers of more than 8 bits, or of floating-point numbers."""
     with opened_picture(path, "train") as opened:
-        if not (opened.mode == "F" or opened.mode.startswith("I")):
-            raise io.SceneError.of(
-                path, "a depth map: a grey picture of 16 bits, or .npy", f"one of mode {opened.mode}"
-            )
-        return np.array(opened).astype(np.float64)
+        mode, stored = opened.mode, np.array(opened)
+    if not (mode == "F" or mode.startswith("I")):
+        raise io.SceneError.of(path, "a depth map: a grey picture of 16 bits, or .npy", f"one of mode {mode}")
+    return stored.astype(np.float64)
 
 
 def _read_array(path: Path) -> np.ndarray:

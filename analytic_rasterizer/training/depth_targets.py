@@ -11,7 +11,7 @@ from torch import Tensor
 from .. import io
 from . import colmap
 from .depth import (
-    MISSING,
+    OF_FILES,
     PROBLEMS,
     UNSCALED,
     WRONG,
@@ -132,7 +132,8 @@ def depths_of(options: TrainingOptions, capture: Capture, skip_missing: bool = F
 
     Args:
         capture: In the frame of the training.
-        skip_missing: Whether maps that are not there, or cannot be read, are left out; otherwise they are an error.
+        skip_missing: Whether maps that are not there, cannot be read or hold no depth are left out; otherwise they are
+            an error.
 
     Raises:
         io.SceneError: There is none of it, or none that can be used; says what was found, and what to do.
@@ -178,7 +179,7 @@ def _maps_of(
         f"{len(bad)} {problem}, the first is {bad[0]}" for problem in PROBLEMS if (bad := _about(found, problem))
     ]
     counted = f"{where}: of {given} depth maps {'; '.join(reasons)}"
-    if _about(found, MISSING) and not skip_missing:
+    if any(_about(found, problem) for problem in OF_FILES) and not skip_missing:
         raise io.SceneError(counted, "--missing skip leaves them out")
     if not usable:
         raise io.SceneError(counted, *_advice(found, options), "--depth none does without")
@@ -207,4 +208,5 @@ def _advice(found: Sequence[Measured], options: TrainingOptions) -> list[str]:
         advice.append("depth_params.json beside the cameras, or points, give maps of inverse depths a scale")
     if WRONG in problems and options.depth_fit == "none":
         advice.append("--depth-fit auto fits scales to the points")
+        advice.append("--depth-unit is what 1 means in maps of depths, in world units")
     return advice

@@ -110,7 +110,10 @@ class SceneOptions(Options):
     def __post_init__(self):
         object.__setattr__(self, "footprint", str(resolve_footprint(str(self.footprint))))
         if self.first_footprint not in ("", NO_FOOTPRINT):
-            object.__setattr__(self, "first_footprint", str(resolve_footprint(str(self.first_footprint))))
+            try:
+                object.__setattr__(self, "first_footprint", str(resolve_footprint(str(self.first_footprint))))
+            except ValueError as error:
+                raise ValueError(f"first_footprint: {error}") from None
         super().__post_init__()
         for name in {self.footprint, self.first_footprint} - {"", NO_FOOTPRINT}:
             key_of(resolve_footprint(name), self.order)  # raises for what cannot be combined

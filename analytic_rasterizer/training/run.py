@@ -245,12 +245,13 @@ class Run:
         with self._phase("steps"), interruption() as stopped, display, closing(trainer.pictures):
             ended = False
             while progress.share < 1 and not ended:
+                footprint = trainer.footprint
                 trainer.step()
                 ended = self.ranks.any_of(stopped.is_set())  # on which all ranks have to agree
                 last = progress.share >= 1 or ended
                 first_look = progress.step - progress.stride < FIRST_LOOK <= progress.step
                 if progress.passed(LOOK_PERIOD) or first_look or last:
-                    figures = describe(self._look(display, last))
+                    figures = describe(self._look(display, last, footprint))
                 if viewer is not None:
                     viewer.update(trainer.scene, step=progress.step, text=figures, force=last)
                 if self.save_every and progress.passed(self.save_every) and not last:
@@ -259,8 +260,10 @@ class Run:
         self._write()
         return progress.share >= 1
 
-    def _look(self, display: Display, last: bool) -> dict[str, Any]:
+    def _look(self, display: Display, last: bool, footprint: str) -> dict[str, Any]:
         """Reads the losses and the clock, and notes what they say: in the log, on the screen, for TensorBoard.
+
+        `footprint` is that of the last step.
 
         Waits for the device. Returns the entry of the log.
         """
@@ -278,7 +281,7 @@ class Run:
             "psnr": None if math.isnan(quality) else quality,  # where nothing counts there is none
             "gaussians": self.count(),
             "dropped": self.trainer.dropped,
-            **({"footprint": self.trainer.footprint} if self.options.begins_with else {}),
+            **({"footprint": footprint} if self.options.begins_with else {}),
         }
         self.history.append(entry)
         if self.ranks.is_first:

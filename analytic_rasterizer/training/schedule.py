@@ -160,6 +160,9 @@ def describe_change(before: TrainingOptions, after: TrainingOptions, step: int, 
     rates = [means_rate_at(step, over, options) for over, options in ((share, after), (share * longer, before))]
     text = f"goes on after step {step:,} to {lengths}: the learning rate of the means is {rates[0]:.2g} extents of the "
     text += f"scene, and was {rates[1]:.2g}"
+    if footprint_at(step, share, after) != after.footprint:
+        time = after.footprint_from
+        text += f"; pictures have {after.begins_with} until {f'{time:.0%}' if time <= 1 else f'step {time:,.0f}'}"
     if after.density == "none":
         return text
     if after.seconds:

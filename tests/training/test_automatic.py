@@ -16,7 +16,7 @@ from wall import cameras, write_wall
 
 from analytic_rasterizer import io, training
 from analytic_rasterizer.distributed.ranks import Ranks
-from analytic_rasterizer.training import CaptureSource, TrainingOptions, automatic, files, plan
+from analytic_rasterizer.training import CaptureSource, TrainingOptions, automatic, files, plan, schedule
 
 TINY = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 300, "density": "none"}
 WORDS = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
@@ -151,6 +151,42 @@ def test_what_a_training_begins_with(even, tmp_path, given, expected, capsys):
         seen.append(run.trainer.footprint)
         run.trainer.step()
     assert seen == [expected[0]] * until + [run.options.footprint] * (20 - until)
+
+
+def begun(folder, out, **given) -> tuple[training.Run, list[str], dict]:
+    """A training that begins with `box`; the footprints of its steps, and of its log by the number of the step."""
+    first = {"first_footprint": "box:samples=1", "effects": "none", "scales": (4,)}
+    run, seen = training.Run(folder, out, TrainingOptions(**TINY | DEFAULT | first | given)), []
+    step = run.trainer.step
+    run.trainer.step = lambda: (seen.append(run.trainer.footprint), step())
+    run.train()
+    return run, seen, {entry["step"]: entry["footprint"] for entry in run.history}
+
+
+def test_the_log_says_what_its_steps_had(even, tmp_path):
+    """And the file the footprint that the scene is for, where no step had it, too."""
+    _, seen, logged = begun(even, tmp_path / "a", iterations=110, footprint_from=100)
+    assert logged == {step: seen[step - 1] for step in (10, 100, 110)}
+    assert seen == ["box:samples=1"] * 100 + ["moment:samples=4"] * 10
+    _, seen, logged = begun(even, tmp_path / "b", iterations=20, footprint_from=1)
+    assert {*seen, *logged.values()} == {"box:samples=1"}
+    assert io.read_metadata(tmp_path / "b" / files.SCENE).footprint == "moment:samples=4"
+
+
+def test_a_training_by_the_clock_changes_too(even, tmp_path, monkeypatch):
+    """By a clock on which every step takes 0.01 s. The first steps, before it is read, count nothing."""
+    steps, advance = [], schedule.Progress.advance
+    monkeypatch.setattr(schedule.Clock, "_now", lambda clock: 0.01 * len(steps))
+    monkeypatch.setattr(schedule.Progress, "advance", lambda self, stride=1: (steps.append(1), advance(self, stride)))
+    _, seen, _ = begun(even, tmp_path, seconds=0.6, footprint_from=0.49)
+    assert seen == ["box:samples=1"] * 30 + ["moment:samples=4"] * 30
+
+
+def test_a_longer_training_says_that_it_has_the_first_footprint_again(even, tmp_path):
+    begun(even, tmp_path, iterations=10, footprint_from=0.5)
+    run = training.Run(even, tmp_path, resume=True, iterations=40)
+    assert "; pictures have box:samples=1 until 50%" in run.notes[-1] and run.trainer.footprint == "box:samples=1"
+    assert "pictures have" not in training.Run(even, tmp_path, resume=True, iterations=12).notes[-1]
 
 
 @pytest.mark.parametrize("share, begins", [(20.0, True), (70.0, False), (None, False)])

@@ -136,7 +136,7 @@ def spoil(path) -> None:
             lambda path: save_16(path, np.ones((60, 120))),
             "expected a depth map of the shape of its camera's picture, 1",
         ),
-        (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1"), "a pointer of Git LFS"),
+        (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1"), "expected the content"),
     ],
     ids=["cut", "8 bits", "shape", "lfs"],
 )
@@ -146,7 +146,7 @@ def test_maps_that_cannot_be_used_are_named(tmp_path, change, message):
     change(path)
     found = measured(folder)
     assert [one.problem for one in found] == [depth.BROKEN if i == 3 else "" for i in range(COUNT)]
-    assert found[3].about.startswith(str(path)) and message in found[3].about
+    assert found[3].about.startswith(f"{path}: {message}")
 
 
 @pytest.mark.parametrize(
@@ -177,6 +177,8 @@ def test_other_problems_are_told_apart(tmp_path):
     found = measure_maps(items[:4], points, {}) + measure_maps(items[4:], points[:5], {})
     assert [one.problem for one in found[:5]] == ["", depth.WRONG, "", depth.MISSING, depth.EMPTY]
     assert {one.problem for one in found[5:]} == {depth.UNSCALED} and found[2].map is None
+    about = f"{items[5].depth.path}: expected its scale in depth_params.json, or 20 points in it, got 5"
+    assert found[5].about == about
 
 
 def test_transforms_that_name_no_file(tmp_path):

@@ -176,22 +176,55 @@ def test_what_is_refused(tmp_path):
     unscaled = deep_wall(tmp_path / "unscaled", parameters=False)
     (unscaled / "sparse" / "0" / "points3D.bin").unlink()
     error = refused(unscaled, tmp_path)
-    assert "of 8 depth maps 8 have no scale, and too few points to find it, the first is " in error.message
+    assert "of 8 depth maps 8 have no scale, the first is " in error.message
+    assert error.message.endswith(".png: expected its scale in depth_params.json, or 20 points in it, got 0")
+    assert refused(unscaled, tmp_path, depth_fit="none").message.endswith("depth_params.json (--depth-fit none)")
     assert error.advice[0].startswith("depth_params.json beside the cameras, or points")
     wrong = deep_wall(tmp_path / "wrong", change=lambda i, levels: levels / 3)
     error = refused(wrong, tmp_path, depth_fit="none")
     assert "8 do not fit the points, the first is " in error.message and "by " in error.message
     assert error.advice[0] == "--depth-fit auto fits scales to the points"
+    assert not (tmp_path / "out").exists()
 
 
-def test_maps_that_are_missing_or_broken(tmp_path):
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda path: path.unlink(), "1 are missing, the first is {}"),
+        (lambda path: path.write_bytes(b"no"), "1 cannot be used, the first is {}: unreadable or cut short"),
+        (
+            lambda path: save_16(path, np.ones((60, 120))),
+            "1 cannot be used, the first is {}: expected a depth map of the shape of its camera's picture, "
+            "160 x 120 px, got 120 x 60",
+        ),
+        (lambda path: save_16(path, np.zeros(SIZE[::-1])), "1 hold no depth anywhere, the first is {}"),
+    ],
+    ids=["missing", "broken", "shape", "zero"],
+)
+@pytest.mark.parametrize("folder, write", [("deep", write_transforms), ("depths", deep_wall)])
+def test_a_map_that_is_missing_or_broken_is_an_error(tmp_path, folder, write, spoil, message):
+    write(tmp_path / "wall")
+    path = tmp_path / "wall" / folder / "p_3.png"
+    spoil(path)
+    if folder == "depths" and not path.exists():  # which nothing names
+        assert depths_of(TrainingOptions(depth="maps"), load_capture(tmp_path / "wall")).maps.count(None) == 1
+        return
+    error = refused(tmp_path / "wall", tmp_path)
+    assert "of 8 depth maps " + message.format(path) in error.message
+    assert error.advice == ("--missing skip leaves them out",) and not (tmp_path / "out").exists()
+
+
+def test_a_confidence_that_is_missing_is_an_error(tmp_path):
+    write_transforms(tmp_path / "wall", frames=lambda i, frame: frame | {"confidence_file_path": f"deep/c_{i}.png"})
+    error = refused(tmp_path / "wall", tmp_path)
+    assert f"8 are missing, the first is {tmp_path}/wall/deep/c_" in error.message
+
+
+def test_maps_that_are_missing_or_broken_are_left_out(tmp_path):
     write_transforms(tmp_path / "wall")
     (tmp_path / "wall" / "deep" / "p_3.png").unlink()
     (tmp_path / "wall" / "deep" / "p_4.png").write_bytes(b"no")
     save_16(tmp_path / "wall" / "deep" / "p_5.png", np.zeros(SIZE[::-1]))
-    error = refused(tmp_path / "wall", tmp_path)
-    assert "1 are missing, the first is " in error.message and "p_3.png" in error.message
-    assert error.advice == ("--missing skip leaves them out",)
     run = make_run(tmp_path / "wall", tmp_path / "out", depth="maps", missing="skip", **SMALL)
     said = "\n".join(run.notes)
     assert f"{COUNT - 2 - 3} of {COUNT - 2} photographs have a depth map" in said

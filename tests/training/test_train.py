@@ -126,6 +126,7 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
     "extra, message",
     [
         ("--footprint bx", "footprint must be one of"),
+        ("--first-footprint bx", "first_footprint: footprint must be one of"),
         ("--footprint box:samples=3", "samples must be one of"),
         ("--iterations 0", "iterations must be at least 1, got 0"),
         ("--seconds nan", "seconds must be finite and not negative, got nan"),
