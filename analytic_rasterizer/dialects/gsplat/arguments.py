@@ -226,6 +226,15 @@ def check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any
     return sizes
 
 
+def check_finite_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
+    """Raises ValueError with the place of the first number that is not finite, of those that are read."""
+    for name, tensor in (("viewmats", viewmats[..., :3, :]), ("Ks", Ks[..., :2, :])):
+        bad = tensor.detach().isfinite().logical_not().nonzero()
+        if len(bad):
+            place = tuple(bad[0].tolist())
+            raise ValueError(f"{name} must be finite, got {tensor[place].item()} at {place}")
+
+
 @dataclass(frozen=True)
 class Signal:
     """What Gaussians carry: colours, or extra signals.
@@ -263,6 +272,11 @@ def check_signal(
     shapes = [(*sizes.batch, *of_all), (*sizes.batch, sizes.cameras, *of_all)]
     if degree is not None and sizes.batch:
         shapes.append(of_all)
+    if degree is not None and values.shape not in shapes:
+        of_one = f"{sizes.gaussians}, K, {channels or 'E'}"
+        of_batch = "".join(f"{size}, " for size in sizes.batch)
+        expected = f"({of_batch}{of_one}) or ({of_batch}{sizes.cameras}, {of_one}) of K harmonics"
+        raise ValueError(f"{name} must have shape {expected}, got {tuple(values.shape)}")
     _check_tensor(name, values, means, *shapes)
     if degree is not None:
         if degree not in range(MAX_SH_DEGREE + 1):

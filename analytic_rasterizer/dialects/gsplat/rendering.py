@@ -13,7 +13,7 @@ from ..._C import TILE
 from ...footprints import Footprint
 from ...render.autocast import widened
 from ...render.order import CENTER
-from .arguments import RASTERIZE_MODES, RENDER_MODES, TENSORS, Call, checked
+from .arguments import RASTERIZE_MODES, RENDER_MODES, TENSORS, Call, check_finite_cameras, checked
 from .cameras import flat_cameras, prepared_cameras
 from .ranks import Sharing
 from .scene import KeepAbsolute, Scene, composite, named, upper_triangle
@@ -153,7 +153,12 @@ def rasterization(
     call, sharing = Sharing.agreed(given) if distributed else (checked(given), None)
     mode = call.mode
     scene = _scene(call, sharing)
-    rows, channels = scene.rows(mode, call.colors, call.extra, bool(return_normals), packed or sharing is not None)
+    as_rows = packed or sharing is not None
+    try:
+        rows, channels = scene.rows(mode, call.colors, call.extra, bool(return_normals), as_rows)
+    except ValueError:  # of matrices by their names in 3DGS
+        check_finite_cameras(given.viewmats, given.Ks)
+        raise
     held = rows if packed or sharing is None else sharing.as_table(rows, scene.sizes)
     means2d, absolute = held["means2d"], None
     if absgrad and means2d.requires_grad:
