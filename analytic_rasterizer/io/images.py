@@ -25,9 +25,11 @@ def to_image(color: torch.Tensor):
     """A Pillow image of `color` (3, H, W), or (4, H, W) with alpha: clamped to [0, 1], rounded to 8 bits.
 
     Raises:
+        TypeError, ValueError: Not a tensor of floating-point numbers, or of another shape.
         ImportError: Pillow is missing.
     """
-    return optional_import("PIL.Image").fromarray(_bytes_of(color).numpy())
+    pixels = _bytes_of(color)
+    return optional_import("PIL.Image").fromarray(pixels.numpy())
 
 
 def png(color: torch.Tensor) -> bytes:
@@ -43,9 +45,23 @@ def png(color: torch.Tensor) -> bytes:
 
 
 def _bytes_of(color: torch.Tensor) -> torch.Tensor:
-    """(H, W, channels) uint8 on the CPU of colours (channels, H, W)."""
+    """(H, W, channels) uint8 on the CPU of colours (channels, H, W). Raises TypeError, ValueError as `to_image`."""
+    if not isinstance(color, torch.Tensor):
+        raise TypeError(f"color must be a tensor, got {type(color).__name__}")
+    if color.dim() != 3 or len(color) not in (3, 4):
+        grey = ": expand(3, -1, -1) makes it grey" if color.dim() == 3 and len(color) == 1 else ""
+        raise ValueError(f"color must have shape (3, H, W), or (4, H, W) with alpha, got {tuple(color.shape)}{grey}")
+    if not color.is_floating_point():
+        raise TypeError(f"color must have a floating-point dtype, with colours from 0 to 1, got {color.dtype}")
     pixels = color.detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
     return pixels.permute(1, 2, 0).contiguous()
+
+
+def check_written(path: Path) -> None:
+    """Raises ValueError unless Pillow writes pictures with the suffix of `path`; ImportError if it is missing."""
+    pillow = optional_import("PIL.Image")
+    if pillow.registered_extensions().get(path.suffix.lower()) not in pillow.SAVE:
+        raise ValueError(f"{path}: expected the suffix of a picture, such as .png or .jpg, got {path.suffix!r}")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from .images import png, to_image
+from .images import check_written, png, to_image
 
 DISK_IS_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows has no quota of this name
 PROBE = bytes(1 << 16)
@@ -135,9 +135,9 @@ def save_image(path, picture, **options) -> None:
         options: Those of Pillow's `save`.
 
     Raises:
+        TypeError, ValueError: As `to_image`; ValueError: a suffix of no format.
         OSError: As `write_safely`.
         ImportError: Pillow is missing, which colours in a .png do not need.
-        ValueError: A suffix of no format.
     """
     try:
         image = picture if hasattr(picture, "save") else to_image(picture)
@@ -146,4 +146,6 @@ def save_image(path, picture, **options) -> None:
             raise
         write_bytes(path, png(picture))
         return
+    if "format" not in options:
+        check_written(Path(path))
     write_safely(path, lambda temporary: image.save(temporary, **options))

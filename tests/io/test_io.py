@@ -503,6 +503,37 @@ def test_pictures_are_clamped_and_rounded():
     assert picture[1, :, 2].tolist() == [0, 0, 0, 1, 255, 255]
 
 
+@pytest.mark.parametrize(
+    "color, error, message",
+    [
+        (torch.rand(3, 7, 5).numpy(), TypeError, "color must be a tensor, got ndarray"),
+        (
+            (torch.rand(3, 7, 5) * 255).byte(),
+            TypeError,
+            "color must have a floating-point dtype, with colours from 0 to 1",
+        ),
+        (torch.rand(7, 5, 3), ValueError, r"color must have shape \(3, H, W\), or .*, got \(7, 5, 3\)$"),
+        (torch.rand(1, 3, 7, 5), ValueError, r"got \(1, 3, 7, 5\)$"),
+        (torch.rand(1, 7, 5), ValueError, r"got \(1, 7, 5\): expand\(3, -1, -1\) makes it grey"),
+    ],
+)
+def test_pictures_that_are_none_are_refused(tmp_path, color, error, message):
+    for write in (io.to_image, lambda picture: io.save_image(tmp_path / "a.png", picture)):
+        with pytest.raises(error, match=message):
+            write(color)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name, got", [("a.xyz", "'.xyz'"), ("a.psd", "'.psd'"), ("a", "''")])
+def test_pictures_have_the_suffix_of_a_format(tmp_path, name, got):
+    with pytest.raises(
+        ValueError, match=rf"{name}: expected the suffix of a picture, such as .png or .jpg, got {got}$"
+    ):
+        io.save_image(tmp_path / name, torch.rand(3, 7, 5))
+    io.save_image(tmp_path / name, torch.rand(3, 7, 5), format="PNG")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
 @pytest.mark.parametrize("channels", [3, 4])
 def test_a_png_needs_no_pillow(tmp_path, monkeypatch, channels):
     color = torch.rand(channels, 7, 5, generator=torch.Generator().manual_seed(0))
