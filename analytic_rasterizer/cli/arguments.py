@@ -22,7 +22,7 @@ from ..io.errors import SceneError, SceneWarning
 from ..io.images import BACKGROUNDS
 from ..render.order import ORDERS
 from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
-from ..training.files import results_folder
+from ..training.files import check_results_folder, results_folder
 from .launch import report
 
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
@@ -312,14 +312,14 @@ def use_expandable_segments() -> None:
 
 def writable_folder(path: str) -> Path:
     """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
-    if path == "":  # of a variable of the shell that is not set, mostly
-        raise ValueError("expected the name of a folder for the results, got ''; this folder is '.'")
+    check_results_folder(path)
     folder = results_folder(path)
     try:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError as error:  # which names the temporary file
-        raise OSError(error.errno, error.strerror, str(folder)) from None
+        said = f"the folder for the results cannot be written to ({error.strerror})"
+        raise OSError(error.errno, said, str(folder)) from None
 
 
 def check_writable_file(path: str) -> None:

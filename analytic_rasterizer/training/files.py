@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -29,8 +31,26 @@ def results_folder(path) -> Path:
     folder = Path(path)
     if folder.is_file():
         raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:  # which may name a folder above
+        raise OSError(
+            error.errno, f"the folder for the results cannot be made ({error.strerror})", str(folder)
+        ) from None
     return folder
+
+
+def check_results_folder(path) -> None:
+    """Raises what `results_folder` and the first file in it will, as far as can be known without making anything."""
+    if str(path) == "":  # of a variable of the shell that is not set, mostly
+        raise ValueError("expected the name of a folder for the results, got ''; this folder is '.'")
+    folder = Path(path)
+    there = next(above for above in (folder, *folder.absolute().parents) if os.path.lexists(above))
+    if not there.is_dir():
+        raise NotADirectoryError(f"{there}: expected a folder for the results, got a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        said = "the folder for the results cannot be written to (Permission denied, or read-only)"
+        raise PermissionError(errno.EACCES, said, str(there))
 
 
 def write_log(path: Path, entries: list[dict]) -> None:

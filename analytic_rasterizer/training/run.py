@@ -32,6 +32,7 @@ from .files import (
     OPTIONS,
     SCENE,
     Log,
+    check_results_folder,
     read_checkpoint,
     results_folder,
     write_cameras,
@@ -119,6 +120,7 @@ class Run:
             raise ValueError("iterations and seconds of Run are for resume; otherwise they are among the options")
         self.memory = (memory or PictureMemory())._replace(processes=processes_here(ranks))
         self.memory.check(torch.device(device))  # raises before anything is read
+        check_results_folder(out)
         began = time.perf_counter()
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.scene, self.out = source.folder, Path(out)

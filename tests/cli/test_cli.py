@@ -279,7 +279,8 @@ def test_a_folder_that_cannot_be_written_is_named_and_no_file_in_it(files, capsy
 
     monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
     assert cli.main(arguments(files)) == 2
-    assert capsys.readouterr().err == f"error: {files / 'out'}: Read-only file system\n"
+    said = "the folder for the results cannot be written to (Read-only file system)"
+    assert capsys.readouterr().err == f"error: {files / 'out'}: {said}\n"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")

@@ -122,6 +122,20 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_for_results_that_is_none_is_known_before_the_capture_is_read(
+    synthetic, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("analytic_rasterizer.training.run.settle", None)  # who looks at the capture
+    (tmp_path / "a").write_text("a file")
+    for out in (tmp_path / "a", tmp_path / "a" / "b" / "c"):
+        error = refused(capsys, commands.train, synthetic, out, "--iterations 1")
+        assert error == f"error: {tmp_path / 'a'}: expected a folder for the results, got a file\n"
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    error = refused(capsys, commands.train, synthetic, tmp_path / "b" / "c", "--iterations 1")
+    assert error.startswith(f"error: {tmp_path}: the folder for the results cannot be written to (Permission denied")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
 @pytest.mark.parametrize(
     "extra, message",
     [
