@@ -5,7 +5,9 @@ A footprint is the rule that turns a projected Gaussian into its weight in a pix
 
 from __future__ import annotations
 
+import difflib
 import os
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,6 +143,17 @@ def _nearest(option: str, value: Any, values: tuple) -> str:
     return f"; nearest: {option}={' or '.join(nearest)}" if nearest else ""
 
 
+def _meant(name: str) -> str:
+    """Of a name that no footprint has: a hint at what was meant, or ""."""
+    if name in _GONE:
+        return f"; {_GONE[name]}"
+    first = re.match(r"\w*", name)[0]
+    if first != name and first in FOOTPRINTS:
+        return f"; options follow a colon, as in {RECOMMENDED}"
+    near = difflib.get_close_matches(name.lower(), FOOTPRINTS, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
     """Settles a footprint's options.
 
@@ -164,8 +177,7 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
     name, _, text = name.partition(":")
     if name not in FOOTPRINTS:
-        instead = f"; {_GONE[name]}" if name in _GONE else ""
-        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}{instead}")
+        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}{_meant(name)}")
     settled = dict(OPTIONS.get(name, {}))
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)

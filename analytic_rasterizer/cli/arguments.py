@@ -322,8 +322,13 @@ def writable_folder(path: str) -> Path:
         raise OSError(error.errno, said, str(folder)) from None
 
 
-def check_writable_file(path: str) -> None:
-    """Makes the file's folder if it is missing; OSError before any work is done when the file cannot be written."""
+def check_writable_file(path: str, scene: Path | None = None) -> None:
+    """Makes the file's folder if it is missing; OSError before any work is done when the file cannot be written.
+
+    `scene` is the file that is read, which stays as it is: ValueError where it is the same.
+    """
+    if scene is not None and os.path.exists(path) and os.path.samefile(path, scene):
+        raise ValueError(f"{path}: expected another file than the scene, which is not overwritten")
     writable_folder(Path(path).parent)
     if Path(path).is_dir():
         raise IsADirectoryError(f"{path}: expected a file for the results, got a folder")

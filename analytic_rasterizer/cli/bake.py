@@ -58,7 +58,7 @@ def run(args) -> None:
     views = found.load_views(args.views, args.size, trained_size=not given)
     views = [view.scaled(1 / args.scales) for view in views] if given else views
     loaded = io.load_scene(found.path)
-    check_writable_file(args.out)
+    check_writable_file(args.out, found.path)
     scene = loaded.to(args.device)
     cameras = [view.settings(device=args.device) for view in views]
     seen = torch.zeros(scene.count, dtype=torch.bool, device=args.device)

@@ -52,7 +52,7 @@ def run(args) -> None:
     if args.sh_degree is not None and args.sh_degree < kept.sh_degree:
         kept = kept.with_sh_degree(args.sh_degree)
     metadata = metadata_of(found)
-    check_writable_file(args.out)
+    check_writable_file(args.out, found.path)
     io.save_scene(args.out, kept, metadata, axes=args.axes)
     axes = args.axes or axes_written(kind)
     footprint = f", footprint {metadata.footprint}" if metadata.footprint else ""

@@ -118,9 +118,10 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     else:
         cfg_args = found.cfg_args or CfgArgs()
         if args.data is None:
-            trained = f"; {found.model or found.path.parent} was trained on {cfg_args.source_path}"
-            known = trained if cfg_args.source_path else f", and there is no {OPTIONS} of `train` beside it that does"
-            raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
+            model = found.model or found.path.parent
+            trained = f"; {model} was trained on {cfg_args.source_path}" if cfg_args.source_path else ""
+            nothing = "" if cfg_args.source_path else f", nor does an {OPTIONS} of `train` beside it"
+            raise ValueError(f"{found.path} does not name its capture{nothing}: give --data FOLDER{trained}")
         named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
         images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
         source, options, scales = CaptureSource(args.data, images), None, scales_of(cfg_args, args.images or images)

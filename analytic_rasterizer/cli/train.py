@@ -199,6 +199,8 @@ def _asked_for(args) -> Asked:
         raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
     if args.export and resolve_footprint((stored or options).footprint).name == DILATED:
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
+    if args.points and not Path(args.points).exists():  # known before the pictures are read
+        raise ValueError(f"--points {args.points}: no such file")
     return Asked(options, length, chosen)
 
 

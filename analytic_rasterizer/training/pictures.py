@@ -392,7 +392,7 @@ def fitted(
     left, top = view.width % multiple // 2, view.height % multiple // 2
     size = (view.width - view.width % multiple, view.height - view.height % multiple)
     if not all(size):
-        raise io.SceneError(f"{path}: {width} x {height} px are too few for these scales")
+        raise io.SceneError(f"{path}: {width} x {height} px are too few for these scales, expected at least {multiple}")
     view = replace(view, width=size[0], height=size[1], cx=view.cx - left, cy=view.cy - top)
     rows, columns = slice(top, top + size[1]), slice(left, left + size[0])
     return view, rgba[rows, columns], None if mask is None else mask[rows, columns]

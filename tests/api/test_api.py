@@ -680,6 +680,12 @@ def test_footprints_are_taken_where_their_names_are():
         ({"footprint": "gauss"}, r"footprint must .*got 'gauss'"),
         ({"footprint": ""}, r"footprint must .*got ''"),
         ({"footprint": "adaptive"}, r"footprint must .*got 'adaptive'; take box with 16 samples or moment with 4$"),
+        ({"footprint": "momment"}, r"footprint must .*got 'momment'; did you mean moment\?$"),
+        (
+            {"footprint": "box,samples=4"},
+            r"footprint must .*got 'box,samples=4'; options follow a colon, as in moment:samp",
+        ),
+        ({"footprint": "trapezium"}, r"footprint must .*got 'trapezium'$"),
         ({"footprint": "box", "samples": 3}, r"samples must be one of 1, 4, 16, got 3; nearest: samples=1 or 4$"),
         ({"footprint": "box:samples=8"}, r"samples must be one of 1, 4, 16, got '8'; nearest: samples=4 or 16$"),
         ({"footprint": "moment:samples=9"}, r"samples must be one of 1, 4, 16, got '9'; nearest: samples=4 or 16$"),

@@ -459,6 +459,7 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
         ("--out {}/baked.obj", f"baked.obj: expected a {WRITTEN_IN_WORDS} name, got '.obj'"),
         ("--out {}/baked.json", f"baked.json: expected a {WRITTEN_IN_WORDS} name, got '.json'"),
         ("--out {}/scene.ply/baked.ply", "scene.ply: expected a folder for the results, got a file"),
+        ("--out {}/scene.ply", "scene.ply: expected another file than the scene, which is not overwritten"),
         ("--dilation 0.05", "argument --dilation: must be a number from 1/12, got 0.05"),
         ("--dilation x", "argument --dilation: must be a number from 1/12, got x"),
         ("--scales 0", "argument --scales: must be a reduction, a positive number (2 is half the size), got 0"),

@@ -131,3 +131,13 @@ def test_bake_points_to_convert(tmp_path, capsys):
     io.save_scene(tmp_path / "a.ply", random_gaussians(), io.SceneMetadata(footprint="moment"))
     assert command("bake", tmp_path / "a.ply", "--out", tmp_path / "b.spz") == 2
     assert f"to write it as it is: convert {tmp_path / 'a.ply'} {tmp_path / 'b.spz'}" in capsys.readouterr().err
+
+
+def test_the_scene_is_not_overwritten(tmp_path, capsys):
+    io.save_scene(tmp_path / "a.ply", random_gaussians(degree=3))
+    before = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").symlink_to("a.ply")
+    for name in ("a.ply", "b.ply"):
+        assert command("convert", tmp_path / "a.ply", tmp_path / name, "--sh-degree 0") == 2
+        assert f"{name}: expected another file than the scene, which is not overwritten\n" in capsys.readouterr().err
+    assert (tmp_path / "a.ply").read_bytes() == before

@@ -145,11 +145,11 @@ def test_background_of_a_model(scene, tmp_path, capsys, white, given, background
 
 def test_a_scene_without_a_capture_says_what_is_needed(scene, tmp_path, capsys):
     for given, known in (
-        (scene, "give --data FOLDER, and there is no options.json of `train` beside it that does"),
-        (model_of(scene, tmp_path), "give --data FOLDER; "),
+        (scene, ", nor does an options.json of `train` beside it: give --data FOLDER"),
+        (model_of(scene, tmp_path), ": give --data FOLDER; "),
     ):
         error = refused(capsys, cli.main, ["evaluate", str(given)])
-        assert "does not name its capture: " + known in error
+        assert "does not name its capture" + known in error
     assert "was trained on /data/garden" in error
 
 

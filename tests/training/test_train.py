@@ -148,7 +148,7 @@ def test_a_folder_for_results_that_is_none_is_known_before_the_capture_is_read(
         ("--scales 1,1", "scales must be different from each other"),
         ("--scales 1,2 --scale-repeats 1", "scale_repeats must be 2 numbers"),
         ("--scales one", "must be whole numbers with commas between them, got one"),
-        ("--scales 64 --effects none", "32 x 32 px are too few for these scales"),
+        ("--scales 64 --effects none", "32 x 32 px are too few for these scales, expected at least 64"),
         ("--density more", "density must be one of 3dgs, absgrad, mcmc, none, got more"),
         ("--densify-until 1.5", "densify_until must be 0 to 1, got 1.5 (a share of the training; above 1 it is a "),
         ("--densify-from -2", "densify_from must be 0 to 1, got -2"),
@@ -157,6 +157,7 @@ def test_a_folder_for_results_that_is_none_is_known_before_the_capture_is_read(
         ("--background green", "background must be one of black, white, random, got green"),
         ("--preset quick --opacity-rate 0", "opacity_rate must be positive and finite, got 0.0"),
         ("--density mcmc --max-gaussians 0", 'max_gaussians must be at least 1 with density "mcmc"'),
+        ("--points none.ply", "--points none.ply: no such file"),
         ("--seed 99999999999999", "seed must be -2^39 to 2^40 - 1, got 99999999999999"),
         ("--random-points -1", "random_points must be at least 0, got -1"),
         (
@@ -172,7 +173,6 @@ def test_a_folder_for_results_that_is_none_is_known_before_the_capture_is_read(
         ("--seconds 5 --iterations 10", "--seconds is instead of --iterations: leave out one of them"),
         ("--test-every 1", "test_every must be 0 or at least 2, got 1"),
         ("--resume", "checkpoint.pt: no such file; there is no training to resume"),
-        ("--points none.ply", "none.ply"),
     ],
 )
 def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message):
