@@ -2,7 +2,7 @@
 
 A *scene* is a set of Gaussians (`Gaussians`), read from the files that 3DGS tools write. A *view* is a pinhole
 camera with an image size; its axes are OpenCV's (x right, y down, z forward). Some formats need the libraries of `pip
-install analytic_rasterizer[cli]`; they are imported on first use.
+install "analytic_rasterizer[cli]"`; they are imported on first use.
 """
 
 from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene, is_dilated

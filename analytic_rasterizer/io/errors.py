@@ -104,7 +104,7 @@ def optional_import(name: str, extra: str = "cli"):
         return importlib.import_module(name)
     except ImportError as error:
         package = name.split(".")[0]
-        raise ImportError(f"this needs {package}: pip install analytic_rasterizer[{extra}] ({error})") from None
+        raise ImportError(f'this needs {package}: pip install "analytic_rasterizer[{extra}]" ({error})') from None
 
 
 def first_line(error: BaseException) -> str:

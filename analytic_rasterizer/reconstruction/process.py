@@ -80,7 +80,7 @@ def check_installed(source: Path) -> None:
 def missing_library(source: Path) -> str:
     """What to do without pycolmap."""
     return (
-        f"{source}: photographs without cameras need pycolmap: pip install analytic_rasterizer[colmap], or find the "
+        f'{source}: photographs without cameras need pycolmap: pip install "analytic_rasterizer[colmap]", or find the '
         "cameras with COLMAP's own program, colmap automatic_reconstructor"
     )
 

@@ -7,7 +7,7 @@
 
 `Run(CaptureSource("lego", masks="none"), ..)` says how the capture is read.
 
-Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
+Needs the libraries of `pip install "analytic_rasterizer[train]"`; they are imported on first use.
 """
 
 from ..io import load_points

@@ -238,7 +238,7 @@ def test_the_program_prints_the_summary(monkeypatch, tmp_path, capsys):
 def test_missing_library_names_the_extra(monkeypatch, tmp_path, capsys, module):
     monkeypatch.setitem(sys.modules, module, None)
     assert paper_errors.main(["--out", str(tmp_path)]) == 2
-    assert "pip install analytic_rasterizer[analysis]" in capsys.readouterr().err
+    assert 'pip install "analytic_rasterizer[analysis]"' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -426,7 +426,7 @@ def test_errors_are_one_line(files, capsys, extra, message):
 def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(arguments(files)) == 2
-    assert "pip install analytic_rasterizer[analysis]" in capsys.readouterr().err
+    assert 'pip install "analytic_rasterizer[analysis]"' in capsys.readouterr().err
 
 
 def test_trained_scene(tmp_path, plant):

@@ -233,7 +233,7 @@ def test_what_goes_wrong_in_a_film_is_not_called_writing(files, monkeypatch, cap
 def test_a_film_needs_its_library(files, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert render(files, "--out", files / "film.mp4") == 2
-    assert "this needs imageio_ffmpeg: pip install analytic_rasterizer[video]" in capsys.readouterr().err
+    assert 'this needs imageio_ffmpeg: pip install "analytic_rasterizer[video]"' in capsys.readouterr().err
 
 
 def test_a_film_has_one_size(files, capsys):

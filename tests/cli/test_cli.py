@@ -304,7 +304,7 @@ def test_render_on_cuda_agrees_with_the_cpu(files):
 def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(arguments(files)) == 2
-    assert "pip install analytic_rasterizer[cli]" in capsys.readouterr().err
+    assert 'pip install "analytic_rasterizer[cli]"' in capsys.readouterr().err
 
 
 def test_a_warning_is_one_line(files):
@@ -398,7 +398,7 @@ def test_errors_of_inspect_are_one_line(files, capsys, monkeypatch, extra, messa
 
 def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    check_error(inspect_arguments(files, "--plot", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
+    check_error(inspect_arguments(files, "--plot", "a.png"), capsys, 'pip install "analytic_rasterizer[analysis]"')
 
 
 def bake_arguments(files, *extra):

@@ -136,7 +136,7 @@ def test_broken_files_are_named(training, tmp_path, capsys, name, content, messa
 
 def test_without_matplotlib_the_extra_is_named(training, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert "pip install analytic_rasterizer[analysis]" in refused(capsys, command, "report", training)
+    assert 'pip install "analytic_rasterizer[analysis]"' in refused(capsys, command, "report", training)
 
 
 ENTRY = {"step": 10, "seconds": 1.0, "loss": 0.5, "psnr": 20.0, "gaussians": 5}

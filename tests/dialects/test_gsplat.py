@@ -584,7 +584,7 @@ MANY = {"colors": torch.ones(6, 512), "render_mode": "RGB+D"}
         ({"colors": torch.ones(6, 0)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 0"),
         ({"viewmats": NO_POSE}, ValueError, r"viewmats must be finite, got nan at \(1, 2, 3\)"),
         ({"Ks": torch.full((2, 3, 3), math.inf)}, ValueError, r"Ks must be finite, got inf at \(0, 0, 0\)"),
-        ({"sh_degree": 1}, ValueError, r"colors must have shape \(6, K, 3\) or \(2, 6, K, 3\) of K harm.*, got \(6, 3\)"),
+        ({"sh_degree": 1}, ValueError, r"colors must have shape \(6, K, 3\) or \(2, 6, K, 3\) of K.*, got \(6, 3\)"),
         ({"sh_degree": 1, "colors": torch.ones(6, 3, 3)}, ValueError, "colors must have 4 harmonics of degree 1, got"),
         ({"sh_degree": 0.5, "colors": torch.ones(6, 9, 3)}, ValueError, "sh_degree must be 0 to 4, got 0.5"),
         ({"sh_degree": 5, "colors": torch.ones(6, 36, 3)}, ValueError, "sh_degree must be 0 to 4, got 5"),

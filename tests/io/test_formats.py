@@ -291,7 +291,7 @@ def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch
     (tmp_path / "a.sog").write_bytes(sog_file(random_gaussians(degree=0)))
     for module, name in (("zstandard", "a.spz"), ("PIL.Image", "a.sog")):
         monkeypatch.setitem(sys.modules, module, None)
-        with pytest.raises(ImportError, match=rf"{module[:3]}\w*: pip install analytic_rasterizer\[cli\]"):
+        with pytest.raises(ImportError, match=rf'{module[:3]}\w*: pip install "analytic_rasterizer\[cli\]"'):
             io.load_scene(tmp_path / name)
 
 

@@ -214,10 +214,10 @@ def test_missing_library_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsply", None)
     scene = io.load_scene(hand_written(tmp_path))  # which nothing is needed for
     for name in ("a.spz", "a.compressed.ply"):
-        with pytest.raises(ImportError, match=r"gsply: pip install analytic_rasterizer\[cli\]"):
+        with pytest.raises(ImportError, match=r'gsply: pip install "analytic_rasterizer\[cli\]"'):
             io.save_scene(tmp_path / name, scene)
     (tmp_path / "a.spz").write_bytes(b"")
-    with pytest.raises(ImportError, match=r"gsply: pip install analytic_rasterizer\[cli\]"):
+    with pytest.raises(ImportError, match=r'gsply: pip install "analytic_rasterizer\[cli\]"'):
         io.load_scene(tmp_path / "a.spz")
 
 

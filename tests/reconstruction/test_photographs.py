@@ -314,10 +314,10 @@ def test_without_pycolmap_one_sentence_says_what_to_install(tmp_path, capsys, mo
     monkeypatch.setattr(process, "find_spec", lambda name: None)
     folder = photographs(tmp_path / "photographs")
     said = refused(capsys, train, folder, tmp_path / "out")
-    assert "need pycolmap: pip install analytic_rasterizer[colmap], or find the cameras with COLMAP's" in said
+    assert 'need pycolmap: pip install "analytic_rasterizer[colmap]", or find the cameras with COLMAP\'s' in said
     assert not (tmp_path / "out").exists()
     assert commands.command("inspect", folder) == 0
-    assert "pip install analytic_rasterizer[colmap]" in capsys.readouterr().out
+    assert 'pip install "analytic_rasterizer[colmap]"' in capsys.readouterr().out
 
 
 def test_readers_of_captures_name_who_finds_cameras(tmp_path):

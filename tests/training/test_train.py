@@ -844,7 +844,7 @@ def test_a_viewer_starts_with_what_is_trained(synthetic, tmp_path):
 def test_watching_without_viser_names_the_extra(synthetic, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     error = refused(capsys, commands.train, synthetic, tmp_path / "out", "--watch")
-    assert "needs viser: pip install analytic_rasterizer[view]" in error
+    assert 'needs viser: pip install "analytic_rasterizer[view]"' in error
     assert not (tmp_path / "out").exists()
 
 

@@ -161,7 +161,7 @@ def test_tensorboard_has_what_the_log_has(scene, tmp_path):
 def test_without_tensorboard_the_extra_is_named(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     error = refused(capsys, train, scene, tmp_path / "out", "--tensorboard")
-    assert error.startswith("error: this needs tensorboard: pip install analytic_rasterizer[tensorboard]")
+    assert error.startswith('error: this needs tensorboard: pip install "analytic_rasterizer[tensorboard]"')
     assert not (tmp_path / "out").exists()
 
 

@@ -116,7 +116,7 @@ def test_a_bad_camera_is_refused(name, value):
 
 def test_without_viser_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError, match=r"needs viser: pip install analytic_rasterizer\[view\]"):
+    with pytest.raises(ImportError, match=r'needs viser: pip install "analytic_rasterizer\[view\]"'):
         viewer.LiveViewer()
 
 
@@ -125,7 +125,7 @@ def test_the_command_names_the_extra(monkeypatch, tmp_path, capsys):
     io.save_scene(tmp_path / "scene.ply", make_scene())
     monkeypatch.setitem(sys.modules, "viser", None)
     assert cli.main(["view", str(tmp_path / "scene.ply"), "--server"]) == 2
-    assert "pip install analytic_rasterizer[view]" in capsys.readouterr().err
+    assert 'pip install "analytic_rasterizer[view]"' in capsys.readouterr().err
 
 
 def test_the_size_of_moving_frames_follows_from_what_frames_take():
