@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstring>
 #include <numeric>
+#include <string>
 
 #include "core/blend.h"
 #include "instruction_sets.h"
@@ -49,6 +50,23 @@ template <typename T> struct Scene {
 
   /// What splat i shows in channel c.
   T shown(int64_t i, int c) const { return channels.empty() ? (&colors[i].x)[c] : channels[i * count + c]; }
+};
+
+/// Gradients against differences of a loss that jumps where a splat crosses a threshold.
+struct Differences {
+  int compared = 0, smooth = 0;
+
+  /// `loss_at(t)`: the loss where the number that the gradient is by is larger by t. `least`, `times`: of the bound.
+  template <class Loss>
+  void compare(double gradient, const Loss& loss_at, double least, double times, const std::string& name) {
+    if (gradient == 0) return;
+    const double wide = derivative(loss_at, 2e-6), narrow = derivative(loss_at, 1e-6);
+    const double bound = 1e-6 * std::abs(wide) + least;
+    ++compared;
+    if (std::abs(wide - narrow) > bound) return;  // two steps that agree straddle no threshold
+    ++smooth;
+    EXPECT_NEAR(gradient, narrow, times * bound) << name;
+  }
 };
 
 /// Splats from 0.3 px across, some off screen, behind, equally deep, opaque or invisible. Numbers of
@@ -421,25 +439,16 @@ TEST(ChannelRows, GradientsMatchDifferences) {
   const Rendered<double> actual = run();
   double largest = 0;
   for (size_t i = 0; i < 14 * given.size(); ++i) largest = std::max(largest, std::abs(actual.grads[i]));
-  int compared = 0, smooth = 0;
+  Differences differences;
   const auto compare = [&](double& number, double gradient, const char* name) {
-    if (gradient == 0) return;
     const double at = number;
-    const auto slope = [&](double h) {
-      return derivative(
-          [&](double t) {
-            number = at + t;
-            const double loss = loss_of(run(), scene);
-            number = at;
-            return loss;
-          },
-          h);
+    const auto loss_at = [&](double t) {
+      number = at + t;
+      const double loss = loss_of(run(), scene);
+      number = at;
+      return loss;
     };
-    const double wide = slope(2e-6), narrow = slope(1e-6), bound = 1e-6 * std::abs(wide) + 1e-8 * largest;
-    ++compared;
-    if (std::abs(wide - narrow) > bound) return;
-    ++smooth;
-    EXPECT_NEAR(gradient, narrow, 2 * bound) << name;
+    differences.compare(gradient, loss_at, 1e-8 * largest, 2, name);
   };
   const int n = int(given.size());
   for (int i = 0; i < n; i += kSanitized ? 4 : 1) {  // as in RowsTest
@@ -450,8 +459,8 @@ TEST(ChannelRows, GradientsMatchDifferences) {
     compare(scene.opacities[i], actual.grads[10 * n + i], "opacity");
     compare(given[i], actual.dL_dchannels[6 * i], "given channel");
   }
-  EXPECT_GT(compared, kSanitized ? 20 : 80);
-  EXPECT_GT(smooth, compared * (kSanitized ? 8 : 9) / 10);
+  EXPECT_GT(differences.compared, kSanitized ? 20 : 80);
+  EXPECT_GT(differences.smooth, differences.compared * (kSanitized ? 8 : 9) / 10);
 }
 
 // A number that is not finite, in any channel, culls what would show it, and nothing else.
@@ -655,28 +664,18 @@ TEST_P(RowsTest, GradientsMatchDifferences) {
   const Sums<double> sums = blend_vjp<double>(stages, lists, loss.grid, channels, true, n, image,
                                               scene.background.data(), scene.dL_dimage.data(), nullptr, false, 1);
   const RowGrads by_row(f, rows, lists, sums);
-  int compared = 0, smooth = 0;
+  Differences differences;
   const auto compare = [&](int64_t i, double& number, double gradient, const char* name) {
-    if (gradient == 0) return;
     const double at = number;
-    const auto slope = [&](double h) {
-      return derivative(
-          [&](double t) {
-            number = at + t;
-            const Sym2<double> c = rows.cov2d[i];
-            const double det = std::exchange(rows.dets[i], c.xx * c.yy - c.xy * c.xy), value = loss(rows);
-            number = at;
-            rows.dets[i] = det;
-            return value;
-          },
-          h);
+    const auto loss_at = [&](double t) {
+      number = at + t;
+      const Sym2<double> c = rows.cov2d[i];
+      const double det = std::exchange(rows.dets[i], c.xx * c.yy - c.xy * c.xy), value = loss(rows);
+      number = at;
+      rows.dets[i] = det;
+      return value;
     };
-    // Two steps that agree straddle no threshold.
-    const double wide = slope(2e-6), narrow = slope(1e-6), bound = 1e-6 * std::abs(wide) + 1e-7;
-    ++compared;
-    if (std::abs(wide - narrow) > bound) return;
-    ++smooth;
-    EXPECT_NEAR(gradient, narrow, 4 * bound) << name << " " << i;
+    differences.compare(gradient, loss_at, 1e-7, 4, name + (" " + std::to_string(i)));
   };
   // Every difference renders the same scene: under sanitizers that of a few Gaussians.
   for (int64_t i = 0; i < n; i += kSanitized ? 4 : 1) {
@@ -688,8 +687,8 @@ TEST_P(RowsTest, GradientsMatchDifferences) {
     compare(i, rows.cov2d[i].xy, by_row.cov2d[i].xy, "cov2d xy");
     compare(i, rows.cov2d[i].yy, by_row.cov2d[i].yy, "cov2d yy");
   }
-  EXPECT_GT(compared, kSanitized ? 3 : 15);  // of so few the share that is smooth varies
-  EXPECT_GT(smooth, compared * (kSanitized ? 5 : 8) / 10);
+  EXPECT_GT(differences.compared, kSanitized ? 3 : 15);  // of so few the share that is smooth varies
+  EXPECT_GT(differences.smooth, differences.compared * (kSanitized ? 5 : 8) / 10);
 }
 
 // Rows of any numbers make splats that touch no tile or that blend finitely.
