@@ -287,8 +287,18 @@ def check_rotations(rotations: torch.Tensor, count: int) -> None:
 def mean_area_ratio(
     means3D: torch.Tensor, rotations: torch.Tensor, scales: torch.Tensor, others: torch.Tensor, cameras: list
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Area of each Gaussian's projection with `scales` divided by that with `others`, averaged over the cameras that
-    see it: (P,), 1 where there is none. And whether there is one: (P,), bool.
+    """How large projections with `scales` are beside those with `others`, along the lines of sight of cameras.
+
+    Args:
+        means3D: (P, 3) centres, world units.
+        rotations: (P, 4) quaternions (w, x, y, z).
+        scales, others: (P, 3) standard deviations, world units.
+        cameras: As in `compute_3d_filter`, checked.
+
+    Returns:
+        share: (P,) the area with `scales` divided by that with `others`, averaged over the cameras that see the
+            Gaussian; 1 where there is none.
+        seen: (P,) bool, whether there is one.
     """
     axes = rotation_matrices(rotations)  # their columns
     total, count = torch.zeros_like(means3D[:, 0]), torch.zeros_like(means3D[:, 0])

@@ -183,12 +183,12 @@ def agree(samples: list[float], device: str) -> bool:
 
 
 def best_of(samples: list[float], device: str) -> float:
-    """The round that counts: on the CPU the fastest, since other work only ever adds time; on CUDA the median."""
+    """Seconds of the round that counts: on the CPU the fastest, since other work only adds time; on CUDA the median."""
     return statistics.median(samples) if device == "cuda" else min(samples)
 
 
 def seconds_of(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Time until a call returns."""
+    """Seconds until a call returns, by a clock that counts them."""
     start = clock()
     call()
     return clock() - start

@@ -266,11 +266,17 @@ class View:
         return self.lens.unproject(positions).to(pixels.device)
 
     def depths_of(self, points: torch.Tensor) -> torch.Tensor:
-        """(N,) depths of points (N, 3) in the camera's frame: z, or with some lenses the distance from the camera."""
+        """(N,) depths of points (N, 3) in the camera's frame, world units.
+
+        They are z, or with a fisheye or an equirectangular lens the distance from the camera.
+        """
         return points[:, 2] if self.lens is None else self.lens.depths(points)
 
     def in_frame(self, offset: tuple[float, float, float] | None) -> View:
-        """The same camera with positions relative to another offset, as those of a scene with this offset are."""
+        """The same camera with positions relative to another offset, as those of a scene with this offset are.
+
+        Offsets are in world units; None is zero.
+        """
         zero = (0.0, 0.0, 0.0)
         if (self.offset or zero) == (offset or zero):
             return self

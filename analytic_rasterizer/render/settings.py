@@ -141,7 +141,11 @@ class GaussianRasterizationSettings(_Fields):
 
 
 def in_order(settings: GaussianRasterizationSettings, order: str) -> GaussianRasterizationSettings:
-    """The settings with one of `ORDERS` among their effects, and the other effects as they are."""
+    """The settings with one of `ORDERS` among their effects, and the other effects as they are.
+
+    Raises:
+        TypeError, ValueError: As `Effects` for its `order`.
+    """
     effects = settings.effects if isinstance(settings.effects, Effects) else Effects()
     return settings if order == effects.order else settings._replace(effects=replace(effects, order=order))
 

@@ -54,7 +54,7 @@ def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float
 def random_points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Positions (count, 3) in the cube from -1.3 to 1.3, where NeRF-synthetic scenes are, and grey, (count, 3) of 0.5.
 
-    Drawn by `seed`, on the CPU. Random colours, of which nothing is known, would only have to be unlearned.
+    float32, drawn by `seed`, on the CPU. Random colours, of which nothing is known, would only have to be unlearned.
     """
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
