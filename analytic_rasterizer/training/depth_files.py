@@ -1,7 +1,8 @@
 """Depth maps beside photographs: where they are, and what their files hold.
 
-Two conventions. 3DGS of 2024 has a folder `depths` of 16-bit PNGs, which hold inverse depths up to a scale and a shift,
+Two conventions. 3DGS of 2024 has a folder `depths` of grey PNGs, which hold inverse depths up to a scale and a shift,
 and beside the cameras depth_params.json with both for each photograph: inverse depth = scale * stored / 2^16 + offset.
+They have 16 bits, or the 8 in each of three channels that Depth Anything writes, which 3DGS divides by 2^16 as well.
 nerfstudio has depth_file_path in the frames of a transforms.json: a 16-bit PNG or a .npy with depths in units of its
 depth_unit_scale_factor, in which 0 stands for what was not measured.
 
@@ -35,7 +36,7 @@ class DepthFile(NamedTuple):
     """The depth map of a photograph, of the shape of its camera's picture.
 
     Attributes:
-        path: A 16-bit PNG or a .npy.
+        path: A 16-bit PNG, one of inverse depths with 8 bits, or a .npy.
         is_inverse: Whether it holds inverse depths, divided by 2^16, or depths.
         scale, shift: Inverse depths are scale * raw + shift, 1 / world units. None: the files do not say.
         confidence: A picture of how much each pixel counts, the brightest most, black not at all; None: all alike.
@@ -117,7 +118,7 @@ def read_depth(file: DepthFile, view: io.View) -> tuple[Tensor, Tensor]:
     Raises:
         io.SceneError: A file that cannot be read, or of another kind; another shape than that of the view.
     """
-    stored = _read_array(file.path) if file.path.suffix.lower() == ".npy" else _read_png(file.path)
+    stored = _read_array(file.path) if file.path.suffix.lower() == ".npy" else _read_png(file.path, file.is_inverse)
     height, width = stored.shape
     if not is_reduced(width, height, view.width, view.height):
         expected = f"a depth map of the shape of its camera's picture, {view.width} x {view.height} px"
@@ -131,13 +132,19 @@ def read_depth(file: DepthFile, view: io.View) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.where(known, raw, 0).astype(np.float32)), shares
 
 
-def _read_png(path: Path) -> np.ndarray:
-    """(h, w) float64 of a picture of whole numbers of more than 8 bits, or of floating-point numbers."""
+def _read_png(path: Path, is_inverse: bool) -> np.ndarray:
+    """(h, w) float64 of a grey picture. Depths need more than 8 bits, which end at 255 units."""
     with opened_picture(path, "train") as opened:
-        mode, stored = opened.mode, np.array(opened)
-    if not (mode == "F" or mode.startswith("I")):
-        raise io.SceneError.of(path, "a depth map: a grey picture of 16 bits, or .npy", f"one of mode {mode}")
-    return stored.astype(np.float64)
+        mode = opened.mode
+        is_deep = mode == "F" or mode.startswith("I")
+        stored = np.array(opened if is_deep else opened.convert("RGB"))
+    if is_deep:
+        return stored.astype(np.float64)
+    is_grey = bool((stored == stored[:, :, :1]).all())
+    if not is_inverse or not is_grey:
+        expected = "a depth map: a grey picture of 16 bits" + ("" if is_inverse else ", or .npy")
+        raise io.SceneError.of(path, expected, f"one of mode {mode}{'' if is_grey else ' in colours'}")
+    return stored[:, :, 0].astype(np.float64)
 
 
 def _read_array(path: Path) -> np.ndarray:

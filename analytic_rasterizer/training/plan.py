@@ -276,7 +276,7 @@ def _depth(found: Survey) -> Finding:
         return Finding("depth", count, "maps", NOT_KNOWN, "; ".join([*parts, _why_unknown(found.evidence)]))
     parts.append(f"the median point is in {shown_by:.0f} photographs")
     few = shown_by <= FEW
-    if few and (differences or found.tracked):
+    if few:
         parts.append(f"train --depth {'maps' if differences else 'points'} takes what is known of depths")
     return Finding("depth", count, "maps", YES if few else NO, "; ".join(parts))
 
