@@ -292,6 +292,35 @@ TYPED_TEST(RaysKernels, ShareLists) {
   expect_near(run<F, 3>(scene, {24, 16, true}), run<F, 3>(scene, {24}));
 }
 
+/// Windows depend on no tiles: where a splat enters one, lists of every pixel alone would have it. It enters wherever a
+/// node can see it.
+TYPED_TEST(RaysKernels, HaveWhatPixelsList) {
+  using F = TypeParam;
+  if constexpr (F::kMoves) {
+    constexpr TileGrid kOfPixels = {kWidth, kHeight, 0};
+    std::mt19937 bits(3);
+    const auto prepare = [](const Cov2d<float>& cov) { return F::prepare(cov, FootprintOptions{0}); };
+    int entered = 0;
+    for (const auto& splat : random_splats<F>(bits, 400, kOfPixels, -6, 6, 0.95f, prepare, 20)) {
+      std::vector<bool> listed(kPixels);
+      if (splat.level > 0) for_each_tile(support_of<F>(splat), kOfPixels, [&](int64_t pixel) { listed[pixel] = true; });
+      const auto reach = PixelReach<F, float>::of(splat);
+      for (int i = 0; i < kPixels && splat.level > 0; ++i) {
+        const Vec2<float> d = {float(i % kWidth) - splat.mean.x, float(i / kWidth) - splat.mean.y};
+        const bool enters = reach.reaches(d);
+        entered += enters;
+        ASSERT_TRUE(listed[i] || !enters) << i;
+        for (int k = 0; k < 25; ++k) {
+          const Vec2<float> z =
+              transform(F::ellipse(splat.shape), Vec2<float>{d.x + 0.25f * (k % 5 - 2), d.y + 0.25f * (k / 5 - 2)});
+          ASSERT_TRUE(enters || z.x * z.x + z.y * z.y > splat.level) << i << ' ' << k;
+        }
+      }
+    }
+    EXPECT_GT(entered, kPixels);
+  }
+}
+
 /// A device of 7.5 has 64 KiB.
 TYPED_TEST(RaysKernels, FitIntoSharedMemory) {
   using F = TypeParam;
