@@ -69,7 +69,7 @@ template <class P, typename T> AR_ONE_COPY void blend_rays_tile(const cpu::Blend
   RayList<P, T> list(p, tile);
   const int channels = p.channels.count;
   alignas(64) T transmittance[kSamples][kTilePixels], inside[kTilePixels];
-  alignas(64) int32_t last[kSamples][kTilePixels] = {};
+  alignas(64) const int32_t last[kSamples][kTilePixels] = {};  // The backward pass composites again.
   std::fill_n(inside, kTilePixels, T(-1));
   for_each_run<T>(list.view, p.grid,
                   [&](int first, int64_t, int count) AR_HD_LAMBDA { std::fill_n(inside + first, count, T(1)); });
@@ -81,14 +81,9 @@ template <class P, typename T> AR_ONE_COPY void blend_rays_tile(const cpu::Blend
       alignas(64) int32_t places[kCount];
       store_index(places, entry.place);
       V contribution(T(0));
-      blend_entry<P, T>(
-          list, entry, places, lanes, walk.at, samples, [&](int s, V, const Blended<V>& blended) AR_HD_LAMBDA {
-            contribution = contribution + blended.contribution;
-            if (!p.last) return;
-            int32_t* to = last[s] + pixel;
-            for_each_lane(bits(blended.mask),
-                          [&](int lane) AR_HD_LAMBDA { to[lane] = std::max(to[lane], places[lane] + 1); });
-          });
+      blend_entry<P, T>(list, entry, places, lanes, walk.at, samples,
+                        [&](int, V, const Blended<V>& blended)
+                            AR_HD_LAMBDA { contribution = contribution + blended.contribution; });
       const uint32_t shown = bits(contribution > V(T(0)));
       alignas(64) T numbers[kMaxRayChannels][kCount] = {};
       for_each_lane(shown, [&](int lane) AR_HD_LAMBDA {

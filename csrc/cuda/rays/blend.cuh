@@ -7,7 +7,7 @@
 
 namespace ar::cuda {
 
-/// C: 3 channels in the splats, or up to 4 in rows. With a backward pass `last` gets numbers of composited splats.
+/// C: 3 channels in the splats, or up to 4 in rows. `last` is zero: the backward pass composites again.
 template <class F, int C>
 __global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
@@ -19,7 +19,6 @@ __global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_kernel(cons
   const Pixel pixel(list, params.grid, p);
   RaySamples<F> samples(pixel.inside);
   Values<C> sums = {};
-  int last[S] = {};
   walk_rays<F>(
       params, list, stage, reinterpret_cast<RayEntry*>(&stage + 1), half, pixel.inside,
       [](int, int32_t id) { return id; },
@@ -35,15 +34,13 @@ __global__ void __launch_bounds__(32, RayPolicy::kBlocks) blend_rays_kernel(cons
         AR_UNROLL for (int i = 0; i < kAtOnce; ++i) {
           add_samples<S>(sums, channels[i], [&](int s) {
             float raw;
-            const Blended<float> b = blend_leaving(leaving[i], entries[i], p, s, samples, raw);
-            last[s] += b.mask;
-            return b;
+            return blend_leaving(leaving[i], entries[i], p, s, samples, raw);
           });
         }
         return samples.open();
       });
   AR_UNROLL for (int s = 0; s < S; ++s) {
-    if (params.last && pixel.inside) params.last[s * pixel.image + pixel.index] = last[s];
+    if (params.last && pixel.inside) params.last[s * pixel.image + pixel.index] = 0;
   }
   store_pixel<LaneSamples<S, 1>>(params, pixel, sums, samples.transmittance);
 }

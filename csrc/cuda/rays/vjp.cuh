@@ -21,8 +21,8 @@ template <class F> inline constexpr int kLogWords = 2 + (F::kMoves ? 2 * F::kSam
 /// Values of PairGrad and C channels.
 template <int C> inline constexpr int kRaySums = kPairChannels + C;
 
-/// Adds to rows of pair_grads what lanes have for them: value k to column(k), which is k below 8. A lane with row -1
-/// has nothing. `of_lanes` has room for 32 (kCount | 1) numbers.
+/// Adds to rows of pair_grads what lanes have for them: value k to column(k). A lane with row -1 has nothing.
+/// `of_lanes` has room for 32 (kCount | 1) numbers.
 template <int kCount, class Column>
 __device__ void add_to_rows(float* of_lanes, const float (&values)[kCount], int32_t row, float* pair_grads,
                             Column&& column) {
