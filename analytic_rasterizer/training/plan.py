@@ -311,7 +311,7 @@ def _colors(survey: Survey) -> tuple[Finding, Finding]:
     evidence, tracked, stops = survey.evidence, survey.tracked, torch.stack(list(survey.stops.values()))
     how, source = "at the same points", "tracks" if tracked else "projected points"
     if not evidence.points:
-        how, source = "of what is usual from their direction", "mean light of an object"
+        how, source = "of what is usual from their direction, which hides a slow drift", "mean light of an object"
     known = stops.isfinite().all(1)
     count = int(known.sum())
     if count < LEAST_SEEN:
