@@ -70,9 +70,10 @@ def log_plots(history: Sequence[Mapping[str, Any]]) -> list[Draw]:
     """PSNR, loss and number of Gaussians by step.
 
     Args:
-        history: Entries of log.jsonl: {"step", "psnr" or None, "loss", "gaussians"}, and "footprint" where it changes.
+        history: Entries of log.jsonl: {"step", "psnr" or None, "loss", "gaussians"}, and "footprint", that of the
+            step, where it changes.
     """
-    changes = [later["step"] for one, later in pairwise(history) if one.get("footprint") != later.get("footprint")]
+    changes = [one["step"] for one, later in pairwise(history) if one.get("footprint") != later.get("footprint")]
 
     def plot(name: str, title: str, log: bool = False) -> Draw:
         def draw(ax):

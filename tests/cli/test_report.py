@@ -4,6 +4,7 @@ import html.parser
 import json
 import re
 import sys
+from unittest import mock
 
 import pytest
 import torch
@@ -148,7 +149,10 @@ def texts_of(plot):
 
 def test_a_change_of_the_footprint_is_drawn_where_it_happens():
     history = [ENTRY | {"footprint": "box:samples=1"}, ENTRY | {"step": 20, "footprint": "moment:samples=4"}]
-    assert "step (dotted: another footprint from there on)" in texts_of(log_plots(history)[0])
+    plot, drawn = log_plots(history)[0], mock.MagicMock()
+    assert "step (dotted: another footprint from there on)" in texts_of(plot)
+    plot(drawn)
+    assert [call.args for call in drawn.axvline.call_args_list] == [(10,)]
     assert "step" in texts_of(log_plots([ENTRY, ENTRY | {"step": 20}])[0])
 
 
