@@ -6,9 +6,9 @@ makes OUT/*.tar.gz, the sources, and from them OUT/pt213cpu/analytic-rasterizer/
 torch and CUDA), with the pages of the index. It then installs the wheel from the index into a fresh environment that
 sees the packages of this one, renders a picture there, and runs the given tests, such as tests/api/test_api.py.
 
-Needs torch, pip, setuptools, ninja, pybind11 and wheel, for tests pytest, and no network. The environment variables of
-docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: the GPUs of this
-machine do not decide its architectures.
+Needs torch, pip, setuptools, ninja, pybind11 and wheel, for tests the extra `test`, and no network. The environment
+variables of docs/install.md hold: ANALYTIC_RASTERIZER_CUDA, TORCH_CUDA_ARCH_LIST, MAX_JOBS. A wheel is for others: the
+GPUs of this machine do not decide its architectures.
 """
 
 import importlib.util
@@ -86,7 +86,16 @@ def try_out(wheel: Path, tests: list[str]) -> None:
             run(python, "-m", "pytest", "-q", *tests, cwd=folder, env=environment)
 
 
+def check_packages(tests: list[str]) -> None:
+    """Exits where packages are missing that would be missed after the minutes of the build."""
+    needed = ["pip", "setuptools", "wheel", *(["pytest", "scipy", "mpmath", "hypothesis"] if tests else [])]
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    if missing:
+        sys.exit(f"wheels/build.py needs {', '.join(missing)}: {sys.executable} -m pip install {' '.join(missing)}")
+
+
 def main(out: Path, tests: list[str]) -> None:
+    check_packages(tests)
     out.mkdir(parents=True, exist_ok=True)
     wheel = build(out)
     write_index(out)

@@ -329,7 +329,11 @@ def check_capture(folder: Path, capture: Capture) -> None:
             "--missing skip lets all pixels count where a mask is missing",
         )
     if len(capture.train) < 2:
-        raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
+        few, away = f"{folder}: training needs at least 2 pictures, got {len(capture.train)}", capture.missing
+        if not away:
+            raise io.SceneError(few)
+        counted = counted_files(away, len(files) + len(away), "pictures", "are missing or cannot be read")
+        raise io.SceneError(f"{few}: {counted}", "--images NAME takes another folder")
     if is_one_pose([item.view for item in capture.train]):
         raise io.SceneError(
             f"{folder}: training needs cameras in different directions, or cameras at different places, got all "

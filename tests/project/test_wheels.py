@@ -183,6 +183,18 @@ def test_the_workflow_builds_what_its_folders_say():
     assert f"pair: [{', '.join(sorted(row[0] for row in rows))}]" in text
 
 
+def test_a_build_without_its_packages_ends_before_it_begins(tmp_path, monkeypatch):
+    for name in ("index", "platform_tag"):  # which build.py finds beside itself
+        monkeypatch.setitem(sys.modules, name, module_of(name))
+    building, found = module_of("build"), importlib.util.find_spec
+    lacks = {"wheel", "pytest"}
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in lacks else found("json"))
+    for tests, named in ((["tests/a.py"], "wheel pytest"), ([], "wheel")):
+        with pytest.raises(SystemExit, match=f"needs {', '.join(named.split())}: .* -m pip install {named}$"):
+            building.main(tmp_path / "dist", tests)
+    assert not (tmp_path / "dist").exists()
+
+
 @pytest.mark.parametrize("status", [0, 3])
 def test_an_installation_says_what_it_compiles_and_why_it_fails(capsys, status):
     lines = ["Collecting x", "  [3/14] csrc/cpu/sort.cpp", "  analytic_rasterizer: c++ has no OpenMP", "[notice] pip"]

@@ -846,6 +846,13 @@ def test_cameras_and_pictures_that_are_chosen(tmp_path):
             training.load_capture(tmp_path, cameras=wrong)
 
 
+def test_too_few_pictures_that_are_there(tmp_path):
+    without(tmp_path, *(f"images/r_{i}.png" for i in range(9)))
+    counted = r"got 0: 9 of 9 pictures are missing or cannot be read, the first is .*r_\d\.png; --images NAME takes"
+    with pytest.raises(io.SceneError, match=rf"training needs at least 2 pictures, {counted}"):
+        training.load_capture(tmp_path, missing="skip")
+
+
 def test_missing_pictures_can_be_left_out(tmp_path):
     without(tmp_path, "images/r_0.png", "images/r_5.png")
     found = training.load_capture(tmp_path, missing="skip")
