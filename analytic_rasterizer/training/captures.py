@@ -209,8 +209,11 @@ def _no_cameras(folder: Path) -> io.SceneError:
     """Of a folder in which nothing says where cameras are; advises what is there to go on with."""
     below, pictures = reconstruction_below(folder), count_pictures(folder)
     found = f", got {pictures} pictures without cameras" if pictures else ""
+    above = next((outer for outer in folder.absolute().parents[:2] if is_capture(outer)), None)  # of sparse/0, two
     advice = []
-    if below is not None:
+    if above is not None:
+        advice = [f"{above} is a capture: name that folder"]
+    elif below is not None:
         advice = [f"there is a reconstruction in {below} (--cameras {below}, --images FOLDER)"]
     elif pictures:
         advice = ["train SCENE --out DIR finds the cameras of photographs with COLMAP"]

@@ -846,6 +846,13 @@ def test_cameras_and_pictures_that_are_chosen(tmp_path):
             training.load_capture(tmp_path, cameras=wrong)
 
 
+def test_of_a_part_of_a_capture_the_whole_is_named(tmp_path):
+    without(tmp_path)
+    for name in ("sparse", "sparse/0"):
+        with pytest.raises(io.SceneError, match=f"{name}: expected .*; {re.escape(str(tmp_path))} is a capture: name"):
+            training.load_capture(tmp_path / name)
+
+
 def test_too_few_pictures_that_are_there(tmp_path):
     without(tmp_path, *(f"images/r_{i}.png" for i in range(9)))
     counted = r"got 0: 9 of 9 pictures are missing or cannot be read, the first is .*r_\d\.png; --images NAME takes"
