@@ -77,6 +77,9 @@ def begin(
 
     It is no less than twice the Gaussians of the start: fewer learn worse, also of random ones.
     """
+    maps = [item.depth for item in capture.train if item.depth is not None]
+    if "depth_unit" in chosen and maps and all(file.is_inverse for file in maps):
+        raise ValueError("--depth-unit has no effect: all depth maps hold inverse depths, which have none")
     # Of the files: photographs are often smaller than their cameras say, as those of images_4 are.
     limit = pixel_limit(options, [header[:2] for _, header in read_sizes(capture.train)], chosen)
     start, found = first_gaussians(options, capture, points, chosen)

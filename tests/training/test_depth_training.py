@@ -260,6 +260,16 @@ def test_options_without_effect(tmp_path, given, reason):
         make_run(write_wall(tmp_path / "wall"), tmp_path / "out", chosen=list(given), **SMALL, **given)
 
 
+def test_inverse_depths_have_no_unit(tmp_path):
+    given = {**SMALL, "depth": "maps", "depth_unit": 1.0}
+    folder = deep_wall(tmp_path / "wall")
+    with pytest.raises(ValueError, match="--depth-unit has no effect: all depth maps hold inverse depths"):
+        make_run(folder, tmp_path / "out", chosen=["depth_unit"], **given)
+    make_run(folder, tmp_path / "out", **given)
+    write_transforms(tmp_path / "metric", ".npy", 1.0)
+    make_run(tmp_path / "metric", tmp_path / "other", chosen=["depth_unit"], **given)
+
+
 def test_several_processes_take_no_depths(tmp_path):
     with pytest.raises(ValueError, match="depth must be none for 2 processes, got points"):
         make_run(write_wall(tmp_path / "wall"), tmp_path / "out", ranks=Ranks(0, 2), depth="points", **SMALL)
