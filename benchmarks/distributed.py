@@ -38,13 +38,13 @@ from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.cameras.rotations import rotation_matrices
+from analytic_rasterizer.captures.pictures import Pictures
 from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.cli.launch import make_group
 from analytic_rasterizer.distributed.exchange import Route
 from analytic_rasterizer.distributed.ranks import Ranks, even_counts
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.training import TrainingOptions
-from analytic_rasterizer.training.pictures import Pictures
 from analytic_rasterizer.training.sharded import ShardedTrainer
 from analytic_rasterizer.training.trainer import Trainer
 

@@ -27,9 +27,9 @@ from common import has_cuda
 import analytic_rasterizer as ar
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.captures.depth import points_in
+from analytic_rasterizer.captures.depth_files import DepthFile
 from analytic_rasterizer.training import Capture, Trainer, TrainingOptions, evaluate, load_capture, load_pictures
-from analytic_rasterizer.training.depth import points_in
-from analytic_rasterizer.training.depth_files import DepthFile
 from analytic_rasterizer.training.depth_targets import depths_of
 from analytic_rasterizer.training.evaluation import COLOR_CORRECTED
 from analytic_rasterizer.training.files import write_json

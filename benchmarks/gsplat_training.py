@@ -23,12 +23,12 @@ from common import has_cuda, peaks_of_memory, start_peaks
 
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.captures.extent import extent_of
 from analytic_rasterizer.dialects import gsplat as ours
 from analytic_rasterizer.io import View
 from analytic_rasterizer.losses import l1_ssim
 from analytic_rasterizer.training import TrainingOptions, load_capture
 from analytic_rasterizer.training.evaluation import psnr
-from analytic_rasterizer.training.extent import extent_of
 from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.schedule import Clock, PictureOrder
 from analytic_rasterizer.training.start import starting_gaussians

@@ -29,7 +29,7 @@ from PIL import Image
 
 from analytic_rasterizer import training
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.training.store import DEVICE, FILE, HOST, Made, Store
+from analytic_rasterizer.captures.store import DEVICE, FILE, HOST, Made, Store
 
 PLENTY = 1e6  # GiB
 WALL = 4.0  # from the cameras, whose focal length is the width of a picture

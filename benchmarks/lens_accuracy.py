@@ -43,9 +43,9 @@ from analytic_rasterizer.analysis.reference import UNFILTERED, finite_decibels, 
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.cameras.lens import WIDE, Lens
 from analytic_rasterizer.cameras.rotations import rotation_matrices
+from analytic_rasterizer.captures.undistortion import window_of, without_lens
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
 from analytic_rasterizer.render.effects import NEAR
-from analytic_rasterizer.training.undistortion import window_of, without_lens
 
 SIZE = 128, 96
 FOVS, SIGMAS = (60, 90, 120, 150, 180), (0.5, 3.0, 20.0)  # degrees from the left to the right edge; px

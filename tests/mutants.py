@@ -1,4 +1,4 @@
-"""Twenty mistakes in the project that its tests have to notice, from every room of csrc and of the package.
+"""21 mistakes in the project that its tests have to notice, from every room of csrc and of the package.
 
     python tests/mutants.py                 all of them: some minutes, most of them for compiling
     python tests/mutants.py sh filters      some, by name
@@ -148,11 +148,18 @@ MUTANTS = (
         ("test_gsplat.py", "radii or conics or footprint"),
     ),
     Mutant(
-        "training",
-        "analytic_rasterizer/training/extent.py",
+        "captures",
+        "analytic_rasterizer/captures/extent.py",
         "RADIUS_FACTOR * (places - places.mean(0))",
         "RADIUS_FACTOR * (places - places[0])",
         ("test_train_alive.py", "extent"),
+    ),
+    Mutant(
+        "training",
+        "analytic_rasterizer/training/parts.py",
+        "several and scale == min(scales) else 1",
+        "several and scale == scales[0] else 1",
+        ("test_train.py", "presets_give_way"),
     ),
     Mutant(
         "density",

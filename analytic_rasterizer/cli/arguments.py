@@ -17,11 +17,11 @@ from pathlib import Path
 import torch
 
 from .. import _C
+from ..captures.loading import CHOICES, IMAGES, TEST_PERIOD
 from ..filters import PIXEL_VARIANCE
 from ..io.errors import SceneError, SceneWarning
 from ..io.images import BACKGROUNDS
 from ..render.order import ORDERS
-from ..training.captures import CHOICES, IMAGES, TEST_PERIOD
 from ..training.files import check_results_folder, results_folder
 from .launch import report
 

@@ -10,6 +10,11 @@ from typing import NamedTuple
 from .. import io
 from ..analysis.plots import check_plot, evaluation_plots, save_plots
 from ..analysis.tables import format_table
+from ..captures.extent import seen_distance
+from ..captures.loading import IMAGES, Capture
+from ..captures.reduction import check_scales
+from ..captures.source import READING
+from ..captures.store import processes_here
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
@@ -22,15 +27,10 @@ from ..training import (
     load_pictures,
     save_pictures,
 )
-from ..training.captures import IMAGES, Capture
 from ..training.evaluation import COLOR_CORRECTED, LPIPS_WEIGHTS, MEASURES, about_correction, measured_in_words
-from ..training.extent import seen_distance
 from ..training.falloff import read_falloffs
 from ..training.files import EVALUATION, OPTIONS, SCENE, VIGNETTING, write_json
-from ..training.parts import check_scales
-from ..training.source import READING
 from ..training.start import background_shown
-from ..training.store import processes_here
 from .arguments import (
     add_machine_options,
     add_order,

@@ -15,12 +15,12 @@ from ..analysis.baking import bake_gain
 from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene, steps_of
 from ..analysis.plots import check_plot, save_plots
+from ..captures.evidence import MOST_PHOTOGRAPHS
+from ..captures.loading import IMAGES, is_capture
 from ..io.appearance import holds_scene
 from ..reconstruction.folder import Photographs, find_photographs, is_film
 from ..reconstruction.forecast import forecast
 from ..reconstruction.process import is_installed, missing_library
-from ..training.captures import IMAGES, is_capture
-from ..training.evidence import MOST_PHOTOGRAPHS
 from ..training.plan import plan_capture
 from ..training.report import plots_of_capture
 from .arguments import (

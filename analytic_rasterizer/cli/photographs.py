@@ -7,11 +7,11 @@ from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
+from ..captures.loading import Photograph
+from ..captures.pictures import load_pictures
+from ..captures.source import CaptureSource
 from ..io import FoundScene, SceneError, View, to_image
-from ..training.captures import Photograph
 from ..training.options import TrainingOptions
-from ..training.pictures import load_pictures
-from ..training.source import CaptureSource
 
 
 def find_photographs(found: FoundScene, views: list[View]) -> tuple[dict[int, Callable[[], bytes]], list[str]]:

@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import io
+from ..captures.loading import CHOICES
+from ..captures.source import READING
 from ..declared import declared
 from ..distributed.ranks import Ranks
 from ..footprints import DILATED, resolve_footprint
 from ..reconstruction.capture import is_finished, reconstruct
 from ..reconstruction.folder import check_photographs, find_photographs
 from ..training import CaptureSource, PictureMemory, Run, TrainingOptions
-from ..training.captures import CHOICES
 from ..training.evaluation import COLOR_CORRECTED, about_correction, measured_in_words
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import DECLARATIONS, PRESETS, flag, of_other_control, preset_values, text_of
 from ..training.reports import process_age
-from ..training.source import READING
 from .arguments import (
     METAVARS,
     add_machine_options,

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..captures.layouts import MASKS
+from ..captures.loading import IMAGES
+from ..captures.photographs import read_mask
 from ..io.images import opened_picture
 from ..io.writing import write_json
-from ..training.captures import IMAGES
 from ..training.files import results_folder
-from ..training.layouts import MASKS
-from ..training.photographs import read_mask
 from .films import about_film, take_photographs
 from .folder import LEAST, Photographs, Shot, check_photographs, find_photographs
 from .forecast import FEATURES, LARGEST, forecast, groups_of

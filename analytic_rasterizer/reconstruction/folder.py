@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import io
+from ..captures.layouts import MASK_FILE, MASK_FOLDER, MASKS, mask_of
+from ..captures.loading import IMAGES, is_capture, reconstruction_below
 from ..io.errors import counted_files
 from ..io.images import opened_picture
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
-from ..training.captures import IMAGES, is_capture, reconstruction_below
-from ..training.layouts import MASK_FILE, MASK_FOLDER, MASKS, mask_of
 from .pairs import in_order
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")

@@ -10,18 +10,18 @@
 Needs the libraries of `pip install "analytic_rasterizer[train]"`; they are imported on first use.
 """
 
+from ..captures.extent import extent_of
+from ..captures.loading import Capture, Photograph, load_capture
+from ..captures.pictures import Pictures, load_pictures
+from ..captures.placement import random_points
+from ..captures.source import CaptureSource
+from ..captures.store import PictureMemory
 from ..io import load_points
-from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
-from .extent import extent_of
 from .options import PRESETS, TrainingOptions
-from .pictures import Pictures, load_pictures
-from .placement import random_points
 from .plan import CapturePlan, Finding, plan_capture
 from .run import Run
-from .source import CaptureSource
 from .start import starting_gaussians
-from .store import PictureMemory
 from .trainer import Trainer
 
 __all__ = [

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..captures.loading import IMAGES
+from ..captures.source import CaptureSource
 from ..distributed.ranks import Ranks
-from .captures import IMAGES
 from .corrections import Corrections
 from .options import TrainingOptions, as_words
 from .plan import CapturePlan, plan_capture, stops_of_photographs
-from .source import CaptureSource
 
 LEARNED_ALONE = ("exposure", "vignetting")  # options, of what several processes cannot learn
 

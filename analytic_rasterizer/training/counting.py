@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..captures.pictures import Pictures
 from ..density import FixedDensity
 from ..gaussians import Gaussians
 from .health import Trainer
 from .options import TrainingOptions
-from .pictures import Pictures
 
 COUNTED = "counted"  # the rows among `FixedDensity.extra`
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from .. import io
-from . import colmap
-from .depth import (
+from ..captures import colmap
+from ..captures.depth import (
     OF_FILES,
     PROBLEMS,
     UNSCALED,
@@ -21,9 +21,9 @@ from .depth import (
     measure_maps,
     points_in,
 )
-from .layouts import Capture
+from ..captures.layouts import Capture
+from ..captures.pictures import Pictures
 from .options import TrainingOptions
-from .pictures import Pictures
 
 MARGIN = 0.02  # of an inverse median depth: smaller differences count by their square, for pixels are as wide as that
 

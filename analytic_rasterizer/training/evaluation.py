@@ -14,13 +14,13 @@ from torch import Tensor
 
 from .. import io
 from ..analysis.reference import decibels
+from ..captures.pictures import Pictures
 from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
 from ..losses import counted, ssim
 from ..render.settings import GaussianRasterizationSettings
 from .exposure import best_exposure, corrected
 from .falloff import Known, falloff_of
-from .pictures import Pictures
 from .rendering import render, render_together
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from .. import io
 from ..cameras.lens import SPHERE
+from ..captures.vignetting import ONE_LENS, POWERS, cameras_of
 from .correction_adam import BEGIN, CorrectionAdam
 from .exposure import GAMMA
-from .vignetting import ONE_LENS, POWERS, cameras_of
 
 SAMPLES = 64  # of the squares of radii to which a polynomial is fitted
 SAME_SHAPE = 0.01  # share by which proportions of pictures of one camera may differ, cut to a multiple of the scale

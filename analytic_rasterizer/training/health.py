@@ -9,16 +9,16 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from ..captures.pictures import Pictures
+from ..captures.store import described
 from ..density import FixedDensity
 from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
 from ..io.errors import SceneError
 from ..io.scenes import numbers_of
 from .options import TrainingOptions, flag
-from .pictures import Pictures
 from .rendering import render
 from .schedule import Progress
-from .store import described
 
 NAMED = 3  # photographs in a sentence
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ..captures.depth_files import UNIT
+from ..captures.reduction import SCALES
 from ..checks import check_value
 from ..declared import NOT_NEGATIVE, POSITIVE, SHARE, Options, Range, at_least, described, one_of, option
 from ..density import GradientOptions
 from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.images import BACKGROUNDS
 from ..render.order import CENTER, ORDERS, key_of
-from .depth_files import UNIT
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 EFFECTS = ("auto", "none")
@@ -33,10 +34,6 @@ LEAST_PERIOD = 10  # steps, whose pictures make an average
 SHORT = 7000  # steps of the shortest training that is not
 TOO_SHORT = 150  # steps, in fewer than which new Gaussians do not learn enough
 
-SCALES = Range(
-    lambda scales: len(scales) > 0 and all(scale >= 1 and scale % 1 == 0 for scale in scales),
-    "whole numbers of at least 1",
-)
 WEIGHT = Range(lambda weight: weight == -1 or 0 <= weight < math.inf, "finite and not negative, or -1")
 BACKGROUND = Range(
     lambda name: name in ("", *BACKGROUNDS, RANDOM_BACKGROUND), f"one of {', '.join([*BACKGROUNDS, RANDOM_BACKGROUND])}"
@@ -55,11 +52,6 @@ TIME_OR_USUAL = TIME._replace(fits=lambda value: value == -1 or is_time(value))
 def steps_at(time: float, steps: float) -> float:
     """A time in steps, of `steps` in all."""
     return time if time > 1 else time * steps
-
-
-def check_scales(scales: tuple[int, ...]) -> None:
-    """Raises ValueError unless there are scales, all of them whole numbers of at least 1."""
-    check_value("scales", SCALES.fits(scales), SCALES.expected, scales)
 
 
 def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:

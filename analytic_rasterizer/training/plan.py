@@ -11,10 +11,8 @@ from typing import Any
 import torch
 
 from .. import io
-from ..footprints import FASTEST, INTEGRATING, RECOMMENDED, resolve_footprint
-from .captures import IMAGES, about_folds, lens_models
-from .depth import PROBLEMS
-from .evidence import (
+from ..captures.depth import PROBLEMS
+from ..captures.evidence import (
     LARGEST,
     LEAST_SEEN,
     MOST_PHOTOGRAPHS,
@@ -24,13 +22,15 @@ from .evidence import (
     single_threaded,
     spread_out,
 )
+from ..captures.layouts import Capture, Photograph
+from ..captures.loading import IMAGES, about_folds, lens_models
+from ..captures.photographs import TURNED, Header
+from ..captures.placement import offset_of
+from ..captures.vignetting import falloffs_of
+from ..footprints import FASTEST, INTEGRATING, RECOMMENDED, resolve_footprint
 from .findings import NO, NOT_KNOWN, YES, Finding
-from .layouts import Capture, Photograph
 from .options import as_words, value_in_words
-from .photographs import TURNED, Header
-from .placement import offset_of
 from .survey import Survey, survey
-from .vignetting import falloffs_of
 
 LENS = 0.1  # px: reconstructions fit observations to 0.3 px and more
 # Spreads up to which they are noise, and beyond which they are none, by whether tracks say what is visible. Projected

@@ -12,7 +12,7 @@ from typing import Any
 
 from .. import io
 from ..analysis.plots import Draw, capture_plots, evaluation_plots, log_plots, to_svg
-from .evidence import interval_ranges
+from ..captures.evidence import interval_ranges
 from .files import EVALUATION, LOG, METRICS, OPTIONS
 from .options import TrainingOptions, value_in_words
 from .plan import CapturePlan, plan_capture

@@ -14,13 +14,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .. import io
+from ..captures.loading import Photograph
+from ..captures.pictures import Pictures, load_pictures
+from ..captures.source import CaptureSource
+from ..captures.store import PictureMemory, processes_here
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
 from ..render.order import CENTER
 from .automatic import LEARNED_ALONE, Settled, said_first, settle, start_corrections
-from .captures import Photograph
 from .depth_targets import depths_of
 from .evaluation import evaluate, psnr
 from .files import (
@@ -43,13 +46,10 @@ from .files import (
 from .health import finite_rows, look_at_pictures
 from .interruption import interruption
 from .options import TrainingOptions
-from .pictures import Pictures, load_pictures
 from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .source import CaptureSource
 from .start import background_of, background_shown, begin, of_length
-from .store import PictureMemory, processes_here
 from .trainer import Trainer
 
 if TYPE_CHECKING:

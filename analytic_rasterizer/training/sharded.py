@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from .. import _C
+from ..captures.extent import extent_of
 from ..distributed import OwnSplats
 from ..distributed.cameras import agreed_step
 from ..distributed.ranks import Ranks, even_counts
@@ -26,7 +27,6 @@ from ..gaussians import Gaussians
 from ..optim import MOMENTS
 from .control import regularizers_of
 from .counting import COUNTED
-from .extent import extent_of
 from .rendering import enlarged
 from .trainer import Trainer
 

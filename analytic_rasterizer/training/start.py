@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..captures.evidence import READERS
+from ..captures.extent import seen_distance
+from ..captures.loading import Capture, Photograph
+from ..captures.photographs import counted_pixels
+from ..captures.pictures import read_sizes
+from ..captures.placement import focus_of, points_in_view, random_points
 from ..gaussians import Gaussians
-from .captures import Capture, Photograph
-from .evidence import READERS
-from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
 from .parts import BACKGROUNDS, RANDOM_BACKGROUND
-from .photographs import counted_pixels
-from .pictures import read_sizes
-from .placement import focus_of, points_in_view, random_points
 from .unused import check_effect
 
 FEWEST = 1000  # Gaussians that any training may have

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch
 
 from .. import io
-from . import colmap
-from .captures import check_capture, read_cameras, without_files
-from .depth import Measured, measure_maps
-from .evidence import BrokenPictures, Evidence, gather, object_stops, spread_out, stops_of
-from .extent import outliers_of
-from .layouts import Capture, Photograph
-from .photographs import Header, read_header
+from ..captures import colmap
+from ..captures.depth import Measured, measure_maps
+from ..captures.evidence import BrokenPictures, Evidence, gather, object_stops, spread_out, stops_of
+from ..captures.extent import outliers_of
+from ..captures.layouts import Capture, Photograph
+from ..captures.loading import check_capture, read_cameras, without_files
+from ..captures.photographs import Header, read_header
 
 UNREADABLE = "cannot be read"
 

@@ -12,6 +12,9 @@ import torch
 from torch import Tensor
 
 from .. import _C
+from ..captures.extent import extent_of
+from ..captures.loading import WHITE
+from ..captures.pictures import Pictures
 from ..density import GradientDensity
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import apply_3d_filter, compute_3d_filter
@@ -19,16 +22,13 @@ from ..gaussians import Gaussians
 from ..render.arguments import camera_arguments
 from ..render.seam import turn_of
 from ..render.settings import GaussianRasterizationSettings
-from .captures import WHITE
 from .control import make_density, regularizers_of
 from .corrections import Corrections
 from .counting import Counting, no_rows
 from .depth_targets import Targets
-from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
 from .optimizer import TrainingAdam
 from .options import TrainingOptions
-from .pictures import Pictures
 from .rendering import enlarged
 from .schedule import (
     PictureOrder,

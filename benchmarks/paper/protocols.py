@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from analytic_rasterizer.captures.loading import RECONSTRUCTIONS
 from analytic_rasterizer.footprints import COMPENSATED, DILATED, FOUR_SAMPLES, PAPER, RECOMMENDED
-from analytic_rasterizer.training.captures import RECONSTRUCTIONS
 
 FOUR_SCALES = (1, 2, 4, 8)
 # Of four pictures in ten the full size, of two each of the other scales [Mip-Splatting, Sec. 5.1].

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.timing import describe_machine
-from analytic_rasterizer.training.captures import load_capture
+from analytic_rasterizer.captures.loading import load_capture
+from analytic_rasterizer.captures.pictures import load_pictures
+from analytic_rasterizer.captures.source import CaptureSource
 from analytic_rasterizer.training.evaluation import Perceptual, evaluate
 from analytic_rasterizer.training.files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_text
 from analytic_rasterizer.training.options import TrainingOptions, preset_values
-from analytic_rasterizer.training.pictures import load_pictures
 from analytic_rasterizer.training.run import Run
-from analytic_rasterizer.training.source import CaptureSource
 from analytic_rasterizer.training.start import background_of
 
 from .protocols import Row, Table

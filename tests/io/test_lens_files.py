@@ -117,7 +117,7 @@ def write_reconstruction(folder, models, suffix):
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_reconstructions_of_every_model(tmp_path, suffix):
-    colmap = pytest.importorskip("analytic_rasterizer.training.colmap", reason="needs the train extra")
+    colmap = pytest.importorskip("analytic_rasterizer.captures.colmap", reason="needs the train extra")
     write_reconstruction(tmp_path / "all", PARAMETERS, suffix)
     found = {item.name.removesuffix(".png"): item.view for item in colmap.load_views(tmp_path / "all")}
     assert set(found) == set(PARAMETERS)
@@ -298,7 +298,7 @@ def test_training_with_lenses(tmp_path, lens):
 
 @pytest.mark.parametrize("lens", [*LENSES, ar.Lens.equirectangular()])
 def test_random_points_are_in_the_pictures_of_lenses(lens):
-    placement = pytest.importorskip("analytic_rasterizer.training.placement", reason="needs the train extra")
+    placement = pytest.importorskip("analytic_rasterizer.captures.placement", reason="needs the train extra")
     from capture_files import circle
 
     sphere = {"width": 64, "height": 32, "fx": 64 / (2 * math.pi), "fy": 32 / math.pi}

@@ -9,8 +9,9 @@ import torch
 from cli_extra import image
 
 from analytic_rasterizer import io
+from analytic_rasterizer.captures import colmap
 from analytic_rasterizer.gaussians import SH_C0, Gaussians
-from analytic_rasterizer.training import colmap, random_points
+from analytic_rasterizer.training import random_points
 from analytic_rasterizer.training import rendering as g
 
 

@@ -8,7 +8,7 @@ import torch
 from capture_files import circle, draw_picture, opengl_pose, write_colmap
 from cli_extra import image
 
-from analytic_rasterizer.training.colmap import BY_NAME
+from analytic_rasterizer.captures.colmap import BY_NAME
 
 SIZE = (48, 36)
 POINTS = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5

@@ -9,7 +9,7 @@ from capture_files import looking_at_origin, quaternion
 from cli_extra import image
 
 from analytic_rasterizer import io
-from analytic_rasterizer.training import evidence
+from analytic_rasterizer.captures import evidence
 
 COUNT, SIZE, HALF = 10, (160, 120), 3.0  # photographs, px, half the width of the wall that they show
 

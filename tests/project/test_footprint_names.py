@@ -21,8 +21,8 @@ OTHERS = {
     "analytic_rasterizer/dialects/mip.py": {"mip"},
     "analytic_rasterizer/io/metadata.py": {"mip"},  # what Brush writes into files
     "analytic_rasterizer/training/parts.py": {"box"},  # downsampling
-    "analytic_rasterizer/training/pictures.py": {"box"},
-    "analytic_rasterizer/training/reduction.py": {"box"},
+    "analytic_rasterizer/captures/pictures.py": {"box"},
+    "analytic_rasterizer/captures/reduction.py": {"box"},
 }
 
 

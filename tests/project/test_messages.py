@@ -28,10 +28,9 @@ PRINTED_BY = {
     "cli/__init__.py": tuple(COMMANDS),
     "cli/arguments.py": tuple(COMMANDS),
     **{f"cli/{name}.py": (name,) for name in COMMANDS},
-    **{
-        f"training/{name}.py": READERS for name in ("captures", "layouts", "colmap", "photographs", "pictures", "store")
-    },
-    **{f"training/{name}.py": READERS for name in ("extent", "evidence", "survey")},
+    **{f"captures/{name}.py": ("train",) for name in ("source", "depth")},
+    "captures/": READERS,
+    "training/survey.py": READERS,
     "training/report.py": (),  # what looks like options is its style sheet
     "training/": ("train",),
     "reconstruction/": ("train",),
@@ -118,13 +117,13 @@ def test_options_in_messages_are_those_of_their_commands(module):
 def test_the_messages_are_found():
     """Those of loaders are among them, as advice, and a wrong one is noticed."""
     found = messages()
-    assert ("--missing skip leaves them out", True) in found["training/captures.py"]
+    assert ("--missing skip leaves them out", True) in found["captures/loading.py"]
     assert sum(map(len, found.values())) > 60
     assert unknown_options("cli/render.py", "give --masks none", False) == ["--masks"]
     assert unknown_options("cli/render.py", "bake {} --out FILE or bake {} --masks none", False) == ["--masks"]
-    assert unknown_options("training/captures.py", "--missing skip leaves them out", False) == ["--missing"]
-    assert unknown_options("training/captures.py", "--missing skip leaves them out", True) == []
-    assert unknown_options("training/captures.py", "--mising skip leaves them out", True) == ["--mising"]
+    assert unknown_options("captures/loading.py", "--missing skip leaves them out", False) == ["--missing"]
+    assert unknown_options("captures/loading.py", "--missing skip leaves them out", True) == []
+    assert unknown_options("captures/loading.py", "--mising skip leaves them out", True) == ["--mising"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

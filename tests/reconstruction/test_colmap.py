@@ -12,8 +12,9 @@ from train_extra import image
 from unposed import SIZE, disagreement, draw, places, walk, write_photographs
 
 from analytic_rasterizer import io
+from analytic_rasterizer.captures import colmap, loading
 from analytic_rasterizer.reconstruction import films, process, reconstruct
-from analytic_rasterizer.training import captures, colmap, load_capture
+from analytic_rasterizer.training import load_capture
 
 pytestmark = pytest.mark.skipif(not process.is_installed(), reason="needs the colmap extra")
 
@@ -113,7 +114,7 @@ def real(name, folder, size, every=1):
         with image.open(path) as opened:
             opened.thumbnail((size, size))
             opened.save(folder / path.name, quality=95)
-    return places([item.view for item in captures.load_photographs(data, test_every=0).train])
+    return places([item.view for item in loading.load_photographs(data, test_every=0).train])
 
 
 def test_16_real_photographs_become_a_scene(tmp_path):

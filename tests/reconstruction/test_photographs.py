@@ -16,12 +16,12 @@ from commands import refused
 from train_extra import image
 
 from analytic_rasterizer import io
+from analytic_rasterizer.captures import loading
 from analytic_rasterizer.reconstruction import capture, process
 from analytic_rasterizer.reconstruction.films import sharpness
 from analytic_rasterizer.reconstruction.folder import FOCAL_LENGTH, PLACE, find_photographs
 from analytic_rasterizer.reconstruction.forecast import groups_of
 from analytic_rasterizer.reconstruction.pairs import MOST_EXHAUSTIVE, NEAREST, NEXT, in_order, pairs_of
-from analytic_rasterizer.training import captures
 
 SIZE = (32, 24)
 
@@ -230,7 +230,7 @@ def test_a_capture_is_made_once(tmp_path, capsys, pretend):
     (job,) = jobs
     assert job.masks is not None and len(job.pairs) == 66
     assert not (out / "capture" / "colmap").exists()
-    found = captures.load_capture(out / "capture")
+    found = loading.load_capture(out / "capture")
     assert len(found.train) + len(found.test) == 10 and sum(item.mask is not None for item in found.train) <= 1
     assert json.loads((out / "options.json").read_text())["source"]["scene"] == str(out / "capture")
     assert commands.train(folder, out, "--resume --no-evaluate") == 0
@@ -322,7 +322,7 @@ def test_without_pycolmap_one_sentence_says_what_to_install(tmp_path, capsys, mo
 
 def test_readers_of_captures_name_who_finds_cameras(tmp_path):
     with pytest.raises(io.SceneError, match="got 12 pictures without cameras; train SCENE --out DIR finds the cameras"):
-        captures.load_capture(photographs(tmp_path / "photographs"))
+        loading.load_capture(photographs(tmp_path / "photographs"))
 
 
 # ------------------------------------------------------------------------------------- the process

@@ -11,11 +11,11 @@ from wall import COUNT, SIZE, cameras, write_wall
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
+from analytic_rasterizer.captures.depth import SeenPoints, points_in
+from analytic_rasterizer.captures.reduction import reduced_depths
 from analytic_rasterizer.distributed.ranks import Ranks
 from analytic_rasterizer.training import PictureMemory, TrainingOptions, files, load_capture, load_pictures
-from analytic_rasterizer.training.depth import SeenPoints, points_in
 from analytic_rasterizer.training.depth_targets import MARGIN, PointTargets, depths_of
-from analytic_rasterizer.training.reduction import reduced_depths
 from analytic_rasterizer.training.schedule import depth_weight_at
 
 SMALL = {"iterations": 40, "scales": (4,), "random_points": 150, "max_gaussians": 300, "effects": "none"}

@@ -13,8 +13,9 @@ from cli_extra import image
 from training_step import check_next_step
 
 from analytic_rasterizer import io, training
+from analytic_rasterizer.captures import photographs, pictures
 from analytic_rasterizer.losses import l1_ssim
-from analytic_rasterizer.training import files, photographs, pictures
+from analytic_rasterizer.training import files
 
 SIZE = (40, 36)
 POINTS = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5

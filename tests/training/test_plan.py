@@ -15,10 +15,11 @@ from places import SHARED
 from wall import COUNT, SIZE, cameras, photograph, stored, wall_points, write_tracked, write_wall
 
 from analytic_rasterizer import Lens, cli, io
-from analytic_rasterizer.training import CaptureSource, automatic, colmap, evidence, plan
-from analytic_rasterizer.training.offsets import medians_of
+from analytic_rasterizer.captures import colmap, evidence
+from analytic_rasterizer.captures.offsets import medians_of
+from analytic_rasterizer.captures.photographs import Stored
+from analytic_rasterizer.training import CaptureSource, automatic, plan
 from analytic_rasterizer.training.options import as_words
-from analytic_rasterizer.training.photographs import Stored
 from analytic_rasterizer.training.plan import (
     EXPOSURE,
     NO,

@@ -18,7 +18,8 @@ from runs import around_steps
 from train_extra import image
 
 from analytic_rasterizer import io, training
-from analytic_rasterizer.training import TrainingOptions, captures, evaluate, files
+from analytic_rasterizer.captures import loading
+from analytic_rasterizer.training import TrainingOptions, evaluate, files
 
 sys.path.append(str(ROOT / "benchmarks"))
 import paper_tables
@@ -193,7 +194,7 @@ def test_a_table_is_trained_tested_and_written(blender, tmp_path):
     for row, options in (("3dgs-ss", {"footprint": "point", "supersampling": 2}), ("moment", {"footprint": "moment"})):
         scene = io.load_scene(tmp_path / "blender-multi" / row / "lego" / files.SCENE)
         test = training.load_capture(blender / "lego").test
-        test = training.load_pictures(test, (1, 2, 4, 8), captures.WHITE, "cpu", "blender")
+        test = training.load_pictures(test, (1, 2, 4, 8), loading.WHITE, "cpu", "blender")
         expected = evaluate(scene, test, **options)
         for scale in ("1", "2", "4", "8", "mean"):
             measured = results.tests[row]["lego"]["test"][scale]
@@ -319,7 +320,7 @@ def test_mip_nerf_360_takes_the_folders_of_the_paper(photographs, tmp_path):
         place = photographs / "360_v2" / "bonsai"
         test = training.load_capture(place, images).test
         assert len(test) == 2
-        pictures = training.load_pictures(test, scales, captures.BLACK, "cpu", downsampling)
+        pictures = training.load_pictures(test, scales, loading.BLACK, "cpu", downsampling)
         scene = io.load_scene(tmp_path / folder / row / "bonsai" / files.SCENE)
         measured = results.tests[row]["bonsai"]
         assert measured["test"]["mean"]["psnr"] == pytest.approx(evaluate(scene, pictures, "analytic")["mean"]["psnr"])

@@ -29,13 +29,14 @@ from training_step import TOLERANCE, check_next_step, compared, widened
 
 from analytic_rasterizer import cli, io, optim, training
 from analytic_rasterizer.cameras.lens import Lens
+from analytic_rasterizer.captures import loading, pictures
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.losses import l1_ssim, ssim
 from analytic_rasterizer.render.arguments import camera_arguments
 from analytic_rasterizer.render.seam import turn_of
-from analytic_rasterizer.training import TrainingOptions, captures, files, pictures, schedule
+from analytic_rasterizer.training import TrainingOptions, files, schedule
 from analytic_rasterizer.training import rendering as g
 from analytic_rasterizer.training.evaluation import evaluate, psnr
 
@@ -352,7 +353,7 @@ def test_evaluate_supersamples_as_the_training_did(synthetic, tmp_path, capsys):
 
 
 def cpu_test_pictures(folder):
-    return training.load_pictures(training.load_capture(folder).test, (1, 2), captures.WHITE, "cpu")
+    return training.load_pictures(training.load_capture(folder).test, (1, 2), loading.WHITE, "cpu")
 
 
 @pytest.mark.parametrize(
@@ -837,7 +838,7 @@ def test_a_viewer_starts_with_what_is_trained(synthetic, tmp_path):
     pytest.importorskip("viser", reason="needs the view extra")
     with make_run(synthetic, tmp_path, footprint="moment:samples=4", background="random").start_viewer() as viewer:
         assert [view.name for view in viewer.views] == [view.name for view in circle(10)]
-        assert (viewer.footprint, viewer.background) == ("moment:samples=4", captures.WHITE)
+        assert (viewer.footprint, viewer.background) == ("moment:samples=4", loading.WHITE)
         assert viewer.name == synthetic.name
 
 
@@ -1026,7 +1027,7 @@ def test_evaluate_refuses_scales_that_are_none(trained, capsys, scales, got):
     message = f"scales must be whole numbers of at least 1, got {got}"
     assert refused(capsys, commands.evaluate, trained, f"--scales={scales}") == f"error: {message}\n"
     with pytest.raises(ValueError, match=re.escape(message)):
-        training.load_pictures([], tuple(map(int, scales.split(","))), captures.WHITE, "cpu")
+        training.load_pictures([], tuple(map(int, scales.split(","))), loading.WHITE, "cpu")
     with pytest.raises(ValueError, match=re.escape("got (1.5,)")):
         TrainingOptions(scales=(1.5,))
 

@@ -16,7 +16,8 @@ from commands import refused
 from train_extra import image
 
 from analytic_rasterizer import io, training
-from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files
+from analytic_rasterizer.captures import extent
+from analytic_rasterizer.training import TrainingOptions, extent_of, files
 
 QUICK = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 400}
 FAR = 1e5  # of a camera with a wrong pose

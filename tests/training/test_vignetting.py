@@ -9,8 +9,8 @@ from places import SHARED
 from wall import COUNT, SIZE, cameras, write_wall
 
 from analytic_rasterizer import io
+from analytic_rasterizer.captures.vignetting import cameras_of
 from analytic_rasterizer.training.plan import NO, NOT_KNOWN, YES, plan_capture
-from analytic_rasterizer.training.vignetting import cameras_of
 
 SQUARE, FOURTH = -0.5, -0.3  # stops
 

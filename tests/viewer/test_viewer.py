@@ -431,7 +431,7 @@ def test_a_training_knows_the_photographs_of_its_views(tmp_path, monkeypatch):
     write_pictures(data / "images", cameras, opaque=True)
     assert commands.train(data, out, "--iterations 1 --scales 2,4 --test-every 0") == 0
 
-    monkeypatch.setattr("analytic_rasterizer.training.colmap.load_points", lambda _: pytest.fail("reads the points"))
+    monkeypatch.setattr("analytic_rasterizer.captures.colmap.load_points", lambda _: pytest.fail("reads the points"))
     found = io.find_scene(out)
     views = [*found.load_views(), make_view("elsewhere")]
     photographs, said = find_photographs(found, views)

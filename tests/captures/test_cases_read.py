@@ -19,7 +19,7 @@ from spoiled_captures import (
 )
 
 from analytic_rasterizer import Lens, io, training
-from analytic_rasterizer.training import extent, photographs, pictures
+from analytic_rasterizer.captures import extent, photographs, pictures
 
 TOP = np.s_[:3]  # of masks: what counts
 

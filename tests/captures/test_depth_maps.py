@@ -11,10 +11,11 @@ from depth_maps import deep_wall, depth_of, save_16, write_transforms
 from wall import COUNT, SIZE, cameras, wall_points, write_wall
 
 from analytic_rasterizer import Lens, io
-from analytic_rasterizer.training import depth, plan
-from analytic_rasterizer.training.captures import read_cameras
-from analytic_rasterizer.training.depth import fitted_scale, measure_maps, points_in, seen_points
-from analytic_rasterizer.training.depth_files import DepthFile, read_depth
+from analytic_rasterizer.captures import depth
+from analytic_rasterizer.captures.depth import fitted_scale, measure_maps, points_in, seen_points
+from analytic_rasterizer.captures.depth_files import DepthFile, read_depth
+from analytic_rasterizer.captures.loading import read_cameras
+from analytic_rasterizer.training import plan
 from analytic_rasterizer.training.plan import NO, YES, plan_capture
 
 STEEP = cameras()[:4]  # which see the wall aslant, so that there is a shift

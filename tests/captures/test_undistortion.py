@@ -10,7 +10,7 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.training import undistortion
+from analytic_rasterizer.captures import undistortion
 
 EYE = torch.eye(4, dtype=torch.float64)
 CAMERA = io.View("a", 96, 64, 80.0, 82.0, EYE, 47.0, 33.5)

@@ -20,11 +20,10 @@ from .. import io
 from ..io.errors import SceneWarning, counted_files, naming
 from ..render.order import CENTER
 from ..render.settings import GaussianRasterizationSettings, in_order
-from .captures import Photograph
 from .depth import DepthMap, depth_planes
-from .parts import check_scales
+from .loading import Photograph
 from .photographs import UPRIGHT, Header, Stored, read_file, read_mask, read_size, unreadable_pictures
-from .reduction import reduce, reduced_depths
+from .reduction import check_scales, reduce, reduced_depths
 from .store import DEVICE, FILE, Key, Made, PictureMemory, Plan, Store, columns, free_memory, limits_of, plan_places
 from .undistortion import window_of, without_lens
 

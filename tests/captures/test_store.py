@@ -19,8 +19,9 @@ from train_extra import image
 
 from analytic_rasterizer import io, training
 from analytic_rasterizer.analysis import memory as system
-from analytic_rasterizer.training import PictureMemory, TrainingOptions, photographs, pictures, schedule, store
-from analytic_rasterizer.training.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store
+from analytic_rasterizer.captures import photographs, pictures, store
+from analytic_rasterizer.captures.store import DEVICE, FILE, GIB, HOST, Bytes, Made, Plan, Store
+from analytic_rasterizer.training import PictureMemory, TrainingOptions, schedule
 
 CPU = torch.device("cpu")
 PLENTY = Bytes(100 * GIB, 100 * GIB)

@@ -8,8 +8,8 @@ from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.training import placement
-from analytic_rasterizer.training.photographs import MASK_SIZE, counted_pixels
+from analytic_rasterizer.captures import placement
+from analytic_rasterizer.captures.photographs import MASK_SIZE, counted_pixels
 
 RING = circle(20)  # at 4 from zero, all around, and looking there
 

@@ -29,7 +29,8 @@ from train_extra import image
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, render_stages, training
-from analytic_rasterizer.training import captures, colmap, files, photographs, pictures, placement, undistortion
+from analytic_rasterizer.captures import colmap, loading, photographs, pictures, placement, undistortion
+from analytic_rasterizer.training import files
 from analytic_rasterizer.training.start import first_gaussians
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
@@ -179,7 +180,7 @@ def point_inputs(means) -> dict:
 
 def test_nerf_synthetic_folder(synthetic):
     found = training.load_capture(synthetic)
-    assert (len(found.train), len(found.test), found.background, found.points) == (10, 3, captures.WHITE, None)
+    assert (len(found.train), len(found.test), found.background, found.points) == (10, 3, loading.WHITE, None)
     for item, expected in zip(found.train, circle(10)):
         assert item.files == {1: synthetic / "train" / f"{expected.name}.png"}
         torch.testing.assert_close(item.view.w2c, expected.w2c)
@@ -189,7 +190,7 @@ def test_nerf_synthetic_folder(synthetic):
 def test_colmap_folder(capture):
     found = training.load_capture(capture, "photographs")
     assert [item.view.name for item in found.test] == ["r_0", "r_8"]
-    assert len(found.train) == 7 and found.background == captures.BLACK and found.points[0].shape == (60, 3)
+    assert len(found.train) == 7 and found.background == loading.BLACK and found.points[0].shape == (60, 3)
     assert len(training.load_capture(capture, "photographs", test_every=0).train) == 9
 
 
@@ -231,7 +232,7 @@ def test_nerfstudio_names_its_points(tmp_path):
         write_nerfstudio(tmp_path, lambda content, wrong=wrong: content.update(ply_file_path=wrong))
         with pytest.raises(io.SceneError, match=f"ply_file_path must name a file beside it, got {wrong!r}"):
             training.load_capture(tmp_path)
-    without = captures.load_photographs(tmp_path)  # which reads no points
+    without = loading.load_photographs(tmp_path)  # which reads no points
     assert (len(without.train), len(without.test), without.points) == (7, 2, None)
 
 
@@ -330,7 +331,7 @@ def test_multi_scale_blender_folder(tmp_path):
     found = training.load_capture(tmp_path)
     assert (len(found.train), len(found.test)) == (3, 2)
     assert [sorted(item.files) for item in found.train] == [[1, 2, 4]] * 3
-    loaded = training.load_pictures(found.train, (1, 2, 4), captures.WHITE, "cpu")
+    loaded = training.load_pictures(found.train, (1, 2, 4), loading.WHITE, "cpu")
     assert [loaded.colors[scale][1][0, 0, 0].item() for scale in (1, 2, 4)] == [10, 11, 12]
     assert [loaded.settings[scale][1].image_width for scale in (1, 2, 4)] == [32, 16, 8]
 
@@ -404,10 +405,10 @@ def test_colors_of_points_out_of_range(tmp_path, kind, color, message):
 def test_metadata_of_another_program_is_passed_over(synthetic, tmp_path, content):
     shutil.copytree(synthetic, tmp_path / "scene")
     (tmp_path / "scene" / "metadata.json").write_text(content)
-    assert len(captures.load_capture(tmp_path / "scene").train) == 10
+    assert len(loading.load_capture(tmp_path / "scene").train) == 10
     (tmp_path / "scene" / "transforms_train.json").unlink()
     with pytest.raises(io.SceneError, match=r"metadata\.json: not the metadata of the multi-scale Blender set"):
-        captures.load_capture(tmp_path / "scene")
+        loading.load_capture(tmp_path / "scene")
 
 
 def test_a_list_of_cameras_is_no_capture(tmp_path):
@@ -415,7 +416,7 @@ def test_a_list_of_cameras_is_no_capture(tmp_path):
     io.save_views(tmp_path / "transforms_train.json", [view])
     io.save_views(tmp_path / "transforms_test.json", [view])
     with pytest.raises(io.SceneError, match=r"transforms_\w+.json: expected a transforms file, .* got a list of"):
-        captures.load_capture(tmp_path)
+        loading.load_capture(tmp_path)
 
 
 def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
@@ -462,9 +463,9 @@ def test_pictures_that_were_turned_are_refused(tmp_path):
 def test_colors_of_reduced_pictures(downsampling):
     """They count by their alpha, but in the files of the multi-scale Blender set."""
     rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
-    plain = pictures.reduce(rgba, 1, captures.WHITE, downsampling)[0]
+    plain = pictures.reduce(rgba, 1, loading.WHITE, downsampling)[0]
     assert plain[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
-    on_white = pictures.reduce(rgba, 2, captures.WHITE, downsampling)[0][:, 0, 0].tolist()
+    on_white = pictures.reduce(rgba, 2, loading.WHITE, downsampling)[0][:, 0, 0].tolist()
     premultiplied = pictures.reduce(rgba, 2, None, downsampling)[0][:, 0, 0].tolist()
     if downsampling == "blender":
         assert on_white == [191, 191, 128] and premultiplied == [64, 64, 0, 128]  # 255 (0.5 * 0.5 + 0.5), 128
@@ -479,7 +480,7 @@ def test_reduced_pictures_of_one_color_keep_it(downsampling, scale):
     alpha = torch.randint(256, (16, 24), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.stack([*torch.full((3, 16, 24), 255, dtype=torch.uint8), alpha], 2)
     rgba[..., :3][alpha == 0] = 0  # as programs store what nobody sees
-    assert (pictures.reduce(rgba, scale, captures.WHITE, downsampling)[0] == 255).all()
+    assert (pictures.reduce(rgba, scale, loading.WHITE, downsampling)[0] == 255).all()
 
 
 @pytest.mark.parametrize("scale", [2, 4])
@@ -488,7 +489,7 @@ def test_bicubic_reduction_is_that_of_pillow(scale):
     pixels = torch.randint(256, (16, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     rgba = torch.cat([pixels, torch.full((16, 24, 1), 255, dtype=torch.uint8)], dim=2)
     expected = image.fromarray(pixels.numpy()).resize((24 // scale, 16 // scale), image.Resampling.BICUBIC)
-    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic")[0].permute(1, 2, 0)
+    got = pictures.reduce(rgba, scale, loading.BLACK, "bicubic")[0].permute(1, 2, 0)
     assert (got.int() - torch.from_numpy(np.array(expected)).int()).abs().max() <= 1
 
 
@@ -878,7 +879,7 @@ def test_lenses_of_smaller_pictures(tmp_path):
     write_grey(tmp_path / "images_2", smaller, [f"{view.name}.png" for view in views])
     whole, half = (
         training.load_pictures(
-            training.load_capture(tmp_path, images, lens="undistort").train, (1,), captures.BLACK, "cpu"
+            training.load_capture(tmp_path, images, lens="undistort").train, (1,), loading.BLACK, "cpu"
         ).views[0]
         for images in ("images", "images_2")
     )
@@ -886,7 +887,7 @@ def test_lenses_of_smaller_pictures(tmp_path):
     assert half.fx == whole.fx / 2 and abs(half.width - whole.width / 2) <= 1 and whole.width > 140
     assert abs(half.cx - whole.cx / 2) <= 1
     found = training.load_capture(tmp_path, "images_2").train
-    (exact,) = training.load_pictures(found[:1], (1,), captures.BLACK, "cpu").views
+    (exact,) = training.load_pictures(found[:1], (1,), loading.BLACK, "cpu").views
     assert (exact.width, exact.height, exact.fx) == (70, 66, 75.0) and exact.lens == ar.Lens.perspective((-0.1,))
 
 
@@ -1099,7 +1100,7 @@ def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
         torch.testing.assert_close(item.view.w2c, expected.w2c, rtol=0, atol=0.1)
 
 
-@pytest.mark.parametrize("background", [None, captures.WHITE, captures.BLACK])
+@pytest.mark.parametrize("background", [None, loading.WHITE, loading.BLACK])
 def test_pictures_without_alpha_stay_as_they_are_stored(background):
     """They are not computed; pictures of which one pixel is not opaque are."""
     rgba = torch.randint(0, 256, (7, 9, 4), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .captures import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture, load_photographs
+from .loading import CHOICES, IMAGES, TEST_PERIOD, Capture, load_capture, load_photographs
 
 READING = ("images", "test_every", "cameras", *CHOICES)  # arguments of `load_capture`
 USUAL = {"images": IMAGES, "test_every": TEST_PERIOD} | {name: choices[0] for name, choices in CHOICES.items()}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from wall import cameras, write_wall
 
-from analytic_rasterizer.training.offsets import offsets_of
+from analytic_rasterizer.captures.offsets import offsets_of
 from analytic_rasterizer.training.plan import NO, YES, plan_capture
 
 COUNT, POINTS, SEEN_BY = 48, 2000, 3

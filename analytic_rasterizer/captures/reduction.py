@@ -6,7 +6,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..checks import check_value
+from ..declared import Range
+
 LEAST_SHARE = 1 / 512  # of a pixel that counts: less rounds to none
+
+SCALES = Range(
+    lambda scales: len(scales) > 0 and all(scale >= 1 and scale % 1 == 0 for scale in scales),
+    "whole numbers of at least 1",
+)
+
+
+def check_scales(scales: tuple[int, ...]) -> None:
+    """Raises ValueError unless there are scales, all of them whole numbers of at least 1."""
+    check_value("scales", SCALES.fits(scales), SCALES.expected, scales)
 
 
 def reduce(
