@@ -12,8 +12,9 @@ from .. import io
 from ..io.errors import counted_files, warn_of
 from ..render.effects import NEAR
 from . import colmap
-from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance, shown_share
+from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance
 from .layouts import BLACK, MASKS, WHITE, Capture, Photograph, count_pictures, has_splits, read_layout
+from .lenses import about_folds, about_lenses, about_lost_area
 from .photographs import broken_files
 from .placement import offset_of
 from .undistortion import window_of
@@ -29,7 +30,6 @@ CHOICES = {
     "alpha": ("background", "mask"),
 }
 """Of arguments of `load_capture`, which are options of `train` too; the first is the default."""
-FOLDED = 0.98  # of a picture: a lens that shows less folds back inside it, and not just in its corners
 SEARCH_DEPTH = 3  # folders below SCENE where an error looks for reconstructions
 
 
@@ -109,10 +109,10 @@ def load_capture(
         notes.append(f"{masked} of {len(photographs)} photographs have a mask, whose black pixels do not count")
     if distorted and lens == "undistort":
         _check_windows(folder, distorted)
-        notes.append(_about_lost_area(distorted, len(photographs)))
+        notes.append(about_lost_area(distorted, len(photographs)))
         capture = _undistorted(capture)
     elif distorted:
-        notes.append(_about_lenses(distorted, len(photographs)))
+        notes.append(about_lenses(distorted, len(photographs)))
         notes += about_folds(distorted)
     if offset is None:
         positions = None if capture.points is None else capture.points[0]
@@ -403,41 +403,6 @@ def _undistorted(capture: Capture) -> Capture:
         for items in (capture.train, capture.test)
     )
     return capture._replace(train=train, test=test)
-
-
-def lens_models(items: list[Photograph]) -> str:
-    """The models of the lenses that photographs have, in words."""
-    return ", ".join(sorted({item.view.lens.model for item in items if item.view.lens is not None}))
-
-
-def _about_lenses(distorted: list[Photograph], number: int) -> str:
-    """Which photographs have a lens, in a sentence."""
-    which = f"{len(distorted)} of {number} photographs have a lens ({lens_models(distorted)})"
-    return f"{which}, with which they are rendered"
-
-
-def about_folds(distorted: list[Photograph]) -> list[str]:
-    """What is to be said of photographs whose lens folds back inside the picture, in at most one sentence: nothing is
-    drawn beyond the fold, and nothing can be learned there."""
-    shares = {item.files[1]: shown_share(item.view) for item in distorted}
-    folded = {path: share for path, share in shares.items() if share < FOLDED}
-    if not folded:
-        return []
-    path, least = min(folded.items(), key=lambda entry: entry[1])
-    return [
-        f"the lens of {len(folded)} photographs folds back inside the picture, and shows {least:.0%} of {path.name}, "
-        "so that nothing is learned in the rest: its coefficients are wrong there, so calibrate again, or mask the rest"
-    ]
-
-
-def _about_lost_area(distorted: list[Photograph], number: int) -> str:
-    """What is done with photographs that are undistorted, in a sentence."""
-    lost = [1 - window_of(item.view).kept for item in distorted]
-    low, high = (f"{100 * share:.1f}" for share in (min(lost), max(lost)))
-    return (
-        f"{len(distorted)} of {number} photographs ({lens_models(distorted)}) are resampled to pinholes, for tests "
-        f"too, and lose {low if low == high else f'{low} to {high}'}% of their area at the border (--lens undistort)"
-    )
 
 
 def _relative_to(capture: Capture, offset: tuple[float, float, float] | None) -> Capture:

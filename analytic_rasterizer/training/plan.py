@@ -23,7 +23,8 @@ from ..captures.evidence import (
     spread_out,
 )
 from ..captures.layouts import Capture, Photograph
-from ..captures.loading import IMAGES, about_folds, lens_models
+from ..captures.lenses import about_folds, lens_models
+from ..captures.loading import IMAGES
 from ..captures.photographs import TURNED, Header
 from ..captures.placement import offset_of
 from ..captures.vignetting import falloffs_of

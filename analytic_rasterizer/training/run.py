@@ -410,12 +410,8 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Steps, seconds, milliseconds per step and Gaussians so far."""
         steps, seconds = self.progress.step, self.ranks.from_first(self.clock.read())
-        return {
-            "steps": steps,
-            "seconds": seconds,
-            "ms_per_step": 1e3 * seconds / max(steps, 1),
-            "gaussians": self.count(),
-        }
+        pace = 1e3 * seconds / max(steps, 1)
+        return {"steps": steps, "seconds": seconds, "ms_per_step": pace, "gaussians": self.count()}
 
     def evaluate(self) -> dict[str, Any]:
         """Writes and returns metrics.json: `summary`, and `evaluate` on the test views, if any."""
