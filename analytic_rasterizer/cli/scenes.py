@@ -7,7 +7,6 @@ import sys
 from .. import io
 from ..io import FoundScene, View
 from ..io.appearance import OrderChoice
-from ..render.order import CENTER
 
 
 def say(*lines: str) -> None:
@@ -45,8 +44,8 @@ def settle_views(args, found: FoundScene, required: bool = True) -> tuple[list[V
 
 
 def order_in_words(choice: OrderChoice) -> list[str]:
-    """Why splats are in this order, in a line; none for the usual one."""
-    return [] if choice.order == CENTER else [f"order {choice.order}: {choice.reason}"]
+    """Why splats are in this order, in a line; none where that needs no word."""
+    return [f"order {choice.order}: {choice.reason}"] if choice.reason else []
 
 
 def sizes_in_words(views: list[View]) -> str:

@@ -51,7 +51,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class OrderChoice:
-    """An `Effects.order`, and why it was chosen, as in `Choice`."""
+    """An `Effects.order`, and why it was chosen, as in `Choice`; "" where that needs no word."""
 
     order: str
     reason: str
@@ -207,10 +207,12 @@ class FoundScene:
         if given is not None:
             check_order(given)
             key_of(footprint, given)
-            return OrderChoice(given, "as given")
+            return OrderChoice(given, "" if given == CENTER else "as given")
         own = self.metadata.order
-        if own is None or not can_be_in(footprint, own):
-            return OrderChoice(CENTER, "the usual one")
+        if own in (None, CENTER):
+            return OrderChoice(CENTER, "")
+        if not can_be_in(footprint, own):
+            return OrderChoice(CENTER, f"{self.path.name} says {own}, which {footprint} cannot have")
         return OrderChoice(own, f"{self.path.name} says so")
 
     def _bake_hint(self, footprint: Footprint) -> str:
