@@ -91,14 +91,15 @@ class CaptureSource:
         settled = self.settled()
         return {name: getattr(settled, name) for name in READING}
 
-    def check_out(self, out: Path, capture: Capture) -> None:
+    def check_out(self, out: str | Path, capture: Capture | None = None) -> None:
         """Raises ValueError for a folder of results that is the capture's own, or one of its pictures.
 
         Args:
             out: The folder.
-            capture: What was loaded.
+            capture: What was loaded; None: nothing yet, and folders of pictures are not known.
         """
-        files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
+        items = () if capture is None else (*capture.train, *capture.test)
+        files = [path for item in items for path in item.files.values()]
         own = {Path(self.folder).resolve(), *(path.parent.resolve() for path in files)}
         if Path(out).resolve() in own:
             raise ValueError(f"--out must be another folder than the capture and those of its pictures, got {out}")

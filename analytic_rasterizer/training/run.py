@@ -121,6 +121,8 @@ class Run:
         self.memory = (memory or PictureMemory())._replace(processes=processes_here(ranks))
         self.memory.check(torch.device(device))  # raises before anything is read
         check_results_folder(out)
+        if not resume:
+            source.check_out(out)  # before the look at the capture, which takes seconds
         began = time.perf_counter()
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.scene, self.out = source.folder, Path(out)

@@ -66,3 +66,14 @@ def test_what_says_nothing_of_a_source_is_refused(scene, tmp_path):
         training.Run(scene, tmp_path, speed=1)
     with pytest.raises(TypeError, match="lens must be in the CaptureSource, and not beside it"):
         training.Run(CaptureSource(scene), tmp_path, lens="keep")
+
+
+@pytest.mark.parametrize("way", ["the same", "a slash", "a link"])
+def test_results_in_the_capture_are_refused_before_it_is_looked_at(scene, tmp_path, monkeypatch, way):
+    monkeypatch.setattr(CaptureSource, "load", lambda *_, **__: pytest.fail("the capture was read"))
+    (tmp_path / "link").symlink_to(scene, target_is_directory=True)
+    out = {"the same": scene, "a slash": f"{scene}/", "a link": tmp_path / "link"}[way]
+    before = sorted(scene.rglob("*"))
+    with pytest.raises(ValueError, match="--out must be another folder than the capture"):
+        training.Run(scene, out, TrainingOptions(iterations=2))
+    assert sorted(scene.rglob("*")) == before
