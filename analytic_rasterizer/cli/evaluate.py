@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+
 from .. import io
 from ..analysis.plots import check_plot, evaluation_plots, save_plots
 from ..analysis.tables import format_table
@@ -49,6 +51,7 @@ from .scenes import color_in_words, order_in_words, say
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
 HEADINGS[COLOR_CORRECTED] = ("PSNR, best affine colour", "{:.2f}")  # of each picture
+SAME_POSE = 1e-3  # difference of rotations, and of positions over the size of the cameras' region: files are rounded
 SIMILAR = 0.01  # share by which widths of pictures may differ unmentioned
 
 
@@ -160,6 +163,8 @@ def run_on(ranks: Ranks, args) -> None:
     memory = PictureMemory(processes=processes_here(ranks))
     pictures = load_pictures(capture.test, protocol.scales, background, args.device, options.downsampling, memory)
     said = [] if protocol.options else differences(found, protocol, capture, background)
+    if protocol.options is not None and args.data is not None:
+        said += elsewhere(found, capture)
     chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
     tell(*capture.notes, *said, *chosen, *dict.fromkeys(line for of in orders.values() for line in order_in_words(of)))
     lpips = None
@@ -215,6 +220,33 @@ def differences(found: io.FoundScene, protocol: Protocol, capture: Capture, back
     if abs(tested - trained) > SIMILAR * trained:
         said.append(f"cfg_args: the training's pictures were {trained} px wide, these are {tested:.0f} (--scales)")
     return said
+
+
+def elsewhere(found: io.FoundScene, capture: Capture) -> list[str]:
+    """That no camera of the capture has the pose of one of the training, in lines: of another one, or moved."""
+    try:
+        trained = [] if found.cameras is None else io.load_views(found.cameras)
+    except io.SceneError:  # nothing else needs the file
+        trained = []
+    if not trained:
+        return []
+    ours = poses_of([item.view for item in (*capture.train, *capture.test)], capture.offset)
+    theirs = poses_of(trained, capture.offset)
+    places = theirs[:, 9:]
+    size = (places - places.mean(0)).norm(dim=1).max().item() or 1.0  # of one camera there is none
+    units = theirs.new_tensor([1.0] * 9 + [size] * 3)
+    if torch.cdist(ours / units, theirs / units, p=math.inf).min() <= SAME_POSE:
+        return []
+    return [
+        f"note: no camera of this capture has the pose of one in {found.cameras}, which are those of the training: is "
+        "it the same capture, in the same coordinates?"
+    ]
+
+
+def poses_of(views: list[io.View], offset: tuple[float, float, float] | None) -> torch.Tensor:
+    """(V, 12) float64, camera to world: the rotation by rows, then the position relative to the offset, world units."""
+    c2w = torch.linalg.inv(torch.stack([view.in_frame(offset).w2c.double() for view in views]))
+    return torch.cat([c2w[:, :3, :3].flatten(1), c2w[:, :3, 3]], 1)
 
 
 def default_out(given: str, found: io.FoundScene) -> Path:

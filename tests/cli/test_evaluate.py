@@ -87,6 +87,24 @@ def test_the_file_says_its_footprint(photographs, scene, tmp_path):
     assert list(evaluation(tmp_path / "b_evaluation")["results"]) == ["moment:samples=16"]
 
 
+def test_a_capture_with_other_cameras_is_told(photographs, tmp_path, capsys):
+    """A copy under other names, with less pictures, or farther from zero has the same ones."""
+    out, copy, other = tmp_path / "out", tmp_path / "copy", tmp_path / "other"
+    assert commands.train(photographs, out, "--iterations 1 --sh-degree 0 --no-evaluate") == 0
+    views = [replace(view, name=f"copy_{view.name}") for view in circle(9)[1:]]
+    turn = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]).double()
+    for folder, cameras in ((copy, views), (other, [replace(view, w2c=view.w2c @ turn) for view in circle(9)])):
+        write_colmap(folder / "sparse" / "0", cameras, torch.randn(9, 3), torch.zeros(9, 3, dtype=torch.int32))
+        (folder / "images").mkdir()
+        write_pictures(folder / "images", cameras, opaque=True)
+    for folder, told in ((None, 0), (photographs, 0), (copy, 0), (other, 1)):
+        capsys.readouterr()
+        data = [] if folder is None else ["--data", str(folder)]
+        assert cli.main(["evaluate", str(out), *data, "--pictures", "0", *QUIET]) == 0
+        note = f"note: no camera of this capture has the pose of one in {out / 'cameras.json'}"
+        assert capsys.readouterr().err.count(note) == told
+
+
 def model_of(scene, tmp_path, **values):
     """A model of 3DGS that holds the scene."""
     folder = tmp_path / "model" / "point_cloud" / "iteration_30000"
