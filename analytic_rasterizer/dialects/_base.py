@@ -118,6 +118,10 @@ class GaussianRasterizationSettings(LibrarySettings):
         self._set_keywords(footprint, effects, kwargs)
         return self
 
+    def _names_of_fields(self) -> tuple[str, ...]:
+        # Those of 3DGS 2023 are what is meant by keywords of no dialect, so that one of any dialect may be misspelt.
+        return known_fields() if type(self) is GaussianRasterizationSettings else self._fields
+
     def own_footprint(self) -> Footprint:
         """The footprint to render with where the user chose none."""
         return _resolved(self._own_filter() or PAPER)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import torch
@@ -89,12 +90,19 @@ class GaussianRasterizationSettings(_Fields):
         if footprint is not None:
             self.footprint = resolve_footprint(footprint, **options)
         elif options:
-            known = ", ".join((*self._fields, "footprint", "effects"))
-            raise TypeError(f"settings must be among: {known}; got {', '.join(options)}")
+            known = (*self._fields, "footprint", "effects")
+            names = (*self._names_of_fields(), *known)
+            near = [name for given in options if given not in names for name in get_close_matches(given, names, 1)]
+            hint = f"; did you mean {', '.join(near)}?" if near else ""
+            raise TypeError(f"settings must be among: {', '.join(known)}; got {', '.join(options)}{hint}")
         if effects is not None:
             if not isinstance(effects, Effects) and effects != AUTO:
                 raise TypeError(f'effects must be an Effects or "auto", got {effects!r}')
             self.effects = effects
+
+    def _names_of_fields(self) -> tuple[str, ...]:
+        """Fields that may be meant by a misspelt keyword."""
+        return self._fields
 
     def footprint_in_use(self) -> Footprint:
         """The footprint to render with: that of the settings, or else the default.

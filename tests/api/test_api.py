@@ -134,8 +134,10 @@ def test_missing_and_unknown_fields():
     fields = CAMERA.fields()
     with pytest.raises(TypeError):
         Settings(**{k: v for k, v in fields.items() if k != "debug"})
-    with pytest.raises(TypeError, match="antialias"):
+    with pytest.raises(TypeError, match=r"got antialias$"):
         Settings(**fields, antialias=True)
+    with pytest.raises(TypeError, match=r"got footprnt; did you mean footprint\?$"):
+        Settings(**fields, footprnt="box")
     with pytest.raises(TypeError):
         Settings(*fields.values(), False)
     with pytest.raises((TypeError, ValueError), match="samples"):

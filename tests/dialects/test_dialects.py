@@ -327,6 +327,10 @@ def test_ambiguous_and_missing_settings():
         drop_in.GaussianRasterizationSettings(*values[:4], kernel_size=0.1, **dict(zip(BASE[4:11], values[4:11])))
     with pytest.raises(TypeError, match=r"settings must be among.*nonsense"):
         drop_in.GaussianRasterizationSettings(*values, nonsense=1)
+    # Of any dialect, while none is chosen.
+    for misspelt, near in (("antialiasng", "antialiasing"), ("kernel_sise", "kernel_size"), ("efects", "effects")):
+        with pytest.raises(TypeError, match=rf"got {misspelt}; did you mean {near}\?$"):
+            drop_in.GaussianRasterizationSettings(*values, **{misspelt: 1})
 
 
 def test_arguments_of_other_dialects():
@@ -402,7 +406,7 @@ def test_classes_that_were_imported_before():
     drop_in.set_dialect("mip")
     with pytest.raises(TypeError, match="dialect mip must have kernel_size, which are missing"):
         settings_class(**CAMERA.fields(torch.float32))
-    with pytest.raises(TypeError, match=r"settings must be among.*kernel_size.*got antialiasing"):
+    with pytest.raises(TypeError, match=r"settings must be among.*kernel_size.*got antialiasing$"):
         settings_class(**fields_of("mip"), antialiasing=True)  # a choice is not overruled
     # The library's own classes belong to no dialect.
     assert len(ar.GaussianRasterizer(CAMERA.settings(torch.float32))(**scene_of())) == 2
