@@ -59,12 +59,18 @@ def camera_settings(
     Raises:
         TypeError: world_to_camera or bg is no tensor, or one of the numbers is none, or the lens.
         ValueError: Effects with another lens; world_to_camera has a wrong shape, a focal length that is a number is not
-            positive and finite, a principal point that is one is not finite, or width or height is not a whole number.
+            positive and finite, a principal point that is one is not finite, or width or height is not a whole number;
+            on the CPU world_to_camera is not finite (elsewhere the host would have to wait for the device).
     """
     width, height = whole_number("width", width), whole_number("height", height)
     check_tensors(None, world_to_camera=world_to_camera, **({} if bg is None else {"bg": bg}))
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
+    if world_to_camera.device.type == "cpu" and not torch.compiler.is_compiling():
+        broken = world_to_camera.detach().isfinite().logical_not().nonzero()
+        if len(broken):
+            place = tuple(broken[0].tolist())
+            raise ValueError(f"world_to_camera must be finite, got {world_to_camera[place].item()} at {place}")
     _check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
     if lens is not None:
         effects = _with_lens(effects, lens)

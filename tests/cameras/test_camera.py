@@ -550,6 +550,13 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
         ar.GaussianRasterizer(CAMERA.settings(effects=ar.Effects(filter_3d=width.cpu().double())))(**flat)
 
 
+def pose_with(number):
+    """Settings of a pose with a number that is none."""
+    pose = torch.eye(4).requires_grad_()
+    pose.data[0, 3] = number
+    return ar.camera_settings(pose, 4, 4, 1, 1)
+
+
 @pytest.mark.parametrize(
     "error, message, make",
     [
@@ -581,6 +588,8 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
         (ValueError, "fx must be positive and finite, got -1", lambda: ar.camera_settings(torch.eye(4), 4, 4, -1, 1)),
         (ValueError, "fy must be positive and finite, got inf", lambda: ar.camera_settings(EYE, 4, 4, 1, math.inf)),
         (ValueError, "cx must be finite, got nan", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, math.nan)),
+        (ValueError, r"world_to_camera must be finite, got nan at \(0, 3\)", lambda: pose_with(math.nan)),
+        (ValueError, r"world_to_camera must be finite, got -inf at \(0, 3\)", lambda: pose_with(-math.inf)),
         (ValueError, r"tangent \(6,\), got \(4, 4\) and \(3,\)", lambda: ar.moved(torch.eye(4), torch.zeros(3))),
         (TypeError, 'effects must be an Effects or "auto", got', lambda: CAMERA.settings(effects="all")),
     ],
