@@ -211,10 +211,13 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None, ax
         SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
             harmonics of degree 4 in an .spz, .sog, glTF or USD; no Gaussians in these but .spz; metadata or axes that
             cannot be written; in all formats but .ply numbers that are not finite, and in an .spz means beyond 2^22.
+        TypeError: Before a file is touched. `scene` is no `Gaussians`, or `metadata` is something else.
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply, .spz and .sog need, or `usd`.
     """
     path, kind = Path(path), written_format(path)
+    if not isinstance(scene, Gaussians):
+        raise TypeError(f"scene must be Gaussians, got {type(scene).__name__}")
     if not isinstance(metadata, (SceneMetadata, type(None))):
         raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:

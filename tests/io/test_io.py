@@ -145,6 +145,13 @@ def test_scenes_with_gradients_are_saved(tmp_path):
     assert torch.equal(io.load_scene(tmp_path / "b.ply").means, scene.means)
 
 
+def test_save_scene_refuses_what_is_no_scene(tmp_path):
+    for given in (random_gaussians()._asdict(), tuple(random_gaussians()), None):
+        with pytest.raises(TypeError, match=f"scene must be Gaussians, got {type(given).__name__}"):
+            io.save_scene(tmp_path / "a.ply", given)
+    assert not list(tmp_path.iterdir())
+
+
 def test_save_scene_refuses_other_suffixes(tmp_path):
     with pytest.raises(io.SceneError, match=r"expected a \.ply, \.compressed\.ply, .* or meta\.json name, got '\.obj'"):
         io.save_scene(tmp_path / "scene.obj", random_gaussians())
