@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from .. import io
-from ..io.errors import check_content, first_line
+from ..io.errors import check_content, why_unreadable
 from ..io.images import opened_picture
 from ..io.pictures import PictureFiles
 from .photographs import is_reduced
@@ -155,7 +155,7 @@ def _read_array(path: Path) -> np.ndarray:
         numbers = array.astype(np.float64)
     except (OSError, ValueError, TypeError, EOFError) as error:
         check_content(path)
-        raise io.SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None
+        raise io.SceneError(f"{path}: {why_unreadable(error)}") from None
     if array.ndim != 2:
         raise io.SceneError.of(path, "a depth map of shape (H, W)", array.shape)
     return numbers

@@ -90,8 +90,14 @@ def unreadable() -> Iterator[None]:
     except (SceneError, ImportError):
         raise
     except Exception as error:  # libraries raise a different type for every way in which a file can be broken
-        reason = first_line(error) or type(error).__name__
-        raise SceneError(f"unreadable or cut short ({reason})") from None
+        raise SceneError(why_unreadable(error)) from None
+
+
+def why_unreadable(error: Exception) -> str:
+    """What is wrong with a file, by the error of who read it: the reason of the system, or else that it is broken."""
+    if isinstance(error, OSError) and error.strerror:  # libraries raise OSError without one for broken files
+        return f"unreadable ({error.strerror})"
+    return f"unreadable or cut short ({first_line(error) or type(error).__name__})"
 
 
 def optional_import(name: str, extra: str = "cli"):

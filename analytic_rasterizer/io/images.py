@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from .errors import SceneError, check_content, first_line, optional_import
+from .errors import SceneError, check_content, optional_import, why_unreadable
 
 BLACK = (0.0, 0.0, 0.0)
 """(r, g, b) of a background."""
@@ -74,4 +74,4 @@ def opened_picture(path: Path, extra: str = "cli") -> Iterator[Any]:
     # Pillow raises any of these for broken files, and an error of its own for pictures of more than 178 megapixels.
     except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
         check_content(path)
-        raise SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None
+        raise SceneError(f"{path}: {why_unreadable(error)}") from None

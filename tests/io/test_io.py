@@ -1,7 +1,9 @@
 """Scenes and views: what is read is what the file's own conventions say, and faults are named."""
 
+import errno
 import json
 import math
+import os
 import sys
 from dataclasses import replace
 
@@ -485,6 +487,20 @@ def test_size_of_an_unreadable_picture(tmp_path):
     (tmp_path / "train").mkdir()
     (tmp_path / "train" / "r_0.png").write_text("no picture")
     with pytest.raises(io.SceneError, match=r"r_0\.png: unreadable or cut short \(cannot identify image file"):
+        io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": [FRAME]}))
+
+
+def test_picture_that_the_system_refuses(tmp_path, monkeypatch):
+    """Said to be cut short, of which it says nothing. The superuser, as whom tests may run, may read everything."""
+    pillow = pytest.importorskip("PIL.Image")
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(pillow, "open", refuse)
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "r_0.png").touch()
+    with pytest.raises(io.SceneError, match=r"r_0\.png: unreadable \(Permission denied\)$"):
         io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": [FRAME]}))
 
 
