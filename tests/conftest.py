@@ -101,3 +101,13 @@ def capture(tmp_path_factory):
     write_pictures(folder / "photographs", views, opaque=True)
     write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
     return folder
+
+
+@pytest.fixture(scope="module")
+def trained(synthetic, tmp_path_factory):
+    """A folder of results."""
+    import commands
+
+    out = tmp_path_factory.mktemp("trained")
+    assert commands.train(synthetic, out, "--iterations 40 --random-points 80 --sh-degree 1 --scales 1,2") == 0
+    return out

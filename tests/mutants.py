@@ -159,7 +159,7 @@ MUTANTS = (
         "analytic_rasterizer/training/parts.py",
         "several and scale == min(scales) else 1",
         "several and scale == scales[0] else 1",
-        ("test_train.py", "presets_give_way"),
+        ("test_train_options.py", "presets_give_way"),
     ),
     Mutant(
         "density",

@@ -5,10 +5,12 @@ from dataclasses import fields
 
 import torch
 
-from analytic_rasterizer.training import CaptureSource, Run, Trainer, TrainingOptions
+from analytic_rasterizer.captures import loading
+from analytic_rasterizer.training import CaptureSource, Run, Trainer, TrainingOptions, load_capture, load_pictures
 from analytic_rasterizer.training import rendering as g
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
+SHORT = {"images": "photographs", "iterations": 120, "scales": (1, 2), **TINY}
 OF_RUN = inspect.signature(Run).parameters.keys() - {"device", "iterations", "seconds"}
 OF_SOURCE = {field.name for field in fields(CaptureSource)}
 
@@ -27,6 +29,10 @@ def trained(folder, out, device="cpu", **given) -> Run:
     run = make_run(folder, out, device, **given)
     assert run.train()
     return run
+
+
+def cpu_test_pictures(folder):
+    return load_pictures(load_capture(folder).test, (1, 2), loading.WHITE, "cpu")
 
 
 @torch.no_grad()
