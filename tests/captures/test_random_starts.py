@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from capture_files import circle, tripod
+from capture_files import circle, looking_at_origin, tripod
 from train_extra import image
 
 import analytic_rasterizer as ar
@@ -101,3 +101,27 @@ def test_views_through_a_lens():
     """Where a lens shows nothing, points are ahead of the camera."""
     views = [io.View(view.name, 32, 32, 9.0, 9.0, view.w2c, lens=ar.Lens.perspective((-0.4,))) for view in circle(8)]
     assert placement.points_in_view(views, 800, 0)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("where", [(0, 0, 0), (300, -200, 100)])
+def test_random_points_are_where_the_cameras_look(where):
+    """For cameras around a place, side by side, and at one place, whatever the origin and the unit."""
+    around = circle(12)
+    beside = [io.View(f"{i}", 32, 32, 36.0, 36.0, looking_at_origin(0.0)) for i in range(9)]
+    for i, view in enumerate(beside):
+        view.w2c[0, 3] = 0.02 * i
+    one_place = [io.View(f"{i}", 32, 32, 36.0, 36.0, looking_at_origin(0.5 * i, 0.0)) for i in range(9)]
+    for views, farthest in ((around, 20.0), (beside, 20.0), (one_place, 10.0)):
+        views = [view.in_frame(tuple(-float(number) for number in where)) for view in views]
+        points, colors = placement.points_in_view(views, 500, seed=0)
+        assert points.shape == colors.shape == (500, 3) and points.dtype == torch.float32
+        w2c = torch.stack([view.w2c for view in views])
+        seen = points.double() @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]
+        x, y, z = seen.unbind(2)
+        inside = (z > 0) & ((36 * x / z).abs() <= 16.01) & ((36 * y / z).abs() <= 16.01)
+        assert inside.any(0).all()
+        distances = (points.double() - torch.tensor(where, dtype=torch.float64)).norm(dim=1)
+        assert distances.max() < farthest
+        assert torch.equal(points, placement.points_in_view(views, 500, seed=0)[0])
+    near = placement.points_in_view(around, 500, seed=0)[0].norm(dim=1)
+    assert near.median() < 6  # the place that they look at is at zero, 4 from each

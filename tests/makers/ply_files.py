@@ -47,6 +47,12 @@ def vertices(columns, rows, kind="float", more=()):
     return Element("vertex", properties, [[*row, *(value for _, value in more)] for row in rows.tolist()])
 
 
+def write_points(path, rows, kind="float", colors=None):
+    """A .ply in ASCII of rows of x, y, z, and where their type is given of red, green, blue."""
+    columns = [(kind, axis) for axis in "xyz"] + [(colors, name) for name in ("red", "green", "blue") if colors]
+    path.write_bytes(ply(Element("vertex", columns, rows), layout="ascii"))
+
+
 CAMERA = Element("camera", [("float", "elevation"), ("float", "radius")], [[0.1, 0.2], [0.3, 0.4]])
 FLAGS = Element("flags", [("uchar", "a"), ("short", "b")], [[1, -2], [3, -4], [5, -6]])
 NOTHING = Element("nothing", [("double", "a")], [])
