@@ -138,7 +138,7 @@ MUTANTS = (
         "analytic_rasterizer/dialects/monogs.py",
         "torch.stack([m[2, 1] - m[1, 2],",
         "torch.stack([m[1, 2] - m[2, 1],",
-        ("test_dialects.py", "pose"),
+        ("test_dialect_gradients.py", "pose"),
     ),
     Mutant(
         "gsplat",
