@@ -8,29 +8,25 @@ import scenes
 import torch
 from camera_reference import textbook
 from gsplat_calls import (
+    BOTH_LAYOUTS,
     HEIGHT,
     WIDTH,
     assert_gradients_close,
     cameras_of,
+    composited,
     drop_in,
     gradients,
+    projected,
     render,
     scene_of,
     smooth_call,
+    step_once,
     tolerance,
+    trained,
 )
 from marks import each_precision
 from processes import run_python
 from reference import spherical_harmonics
-from test_gsplat import (
-    BOTH_LAYOUTS,
-    composited,
-    patched,  # noqa: F401  (a fixture)
-    projected,
-    reference,  # noqa: F401  (a fixture)
-    step_once,
-    trained,
-)
 from weights import weighted_sums, weights
 
 import analytic_rasterizer as ar
@@ -192,7 +188,7 @@ def test_a_lens_is_that_of_the_formulas(device, dtype, packed, name, by_z):
 
 
 @pytest.mark.parametrize("mode", dialect.RASTERIZE_MODES)
-def test_a_fisheye_is_that_of_gsplats_reference(reference, mode):  # noqa: F811
+def test_a_fisheye_is_that_of_gsplats_reference(reference, mode):
     """Without coefficients, where gsplat does not clamp and neither does this inside the image."""
     scene, cameras = scene_of(torch.float64, "cpu", count=200), cameras_of(torch.float64, "cpu")
     expected = projected(reference, scene, cameras, mode, "fisheye")
@@ -587,7 +583,7 @@ def test_errors_of_what_is_rendered(change, error, message):
 
 @BOTH_LAYOUTS
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
-def test_default_strategy_runs_on_the_meta_of_a_lens(packed, model, patched):  # noqa: F811
+def test_default_strategy_runs_on_the_meta_of_a_lens(packed, model, patched):
     params, optimizers = trained("cpu")
     cameras = cameras_of(torch.float32, "cpu")
     strategy = patched.DefaultStrategy(refine_start_iter=0, refine_every=2, grow_grad2d=0.0, prune_opa=0.01)
