@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from numbers import Real
 from typing import Any
 
@@ -17,6 +18,15 @@ def check_tensors(device: torch.device | None, **tensors: Any) -> None:
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
         if device is not None and tensor.device != device:
             raise ValueError(f"{name} must be on the device of means3D, {device}, got {tensor.device}")
+
+
+def check_finite(**tensors: torch.Tensor) -> None:
+    """Raises ValueError with the place of the first number that is not finite. Waits for the device of tensors."""
+    for name, tensor in tensors.items():
+        finite = tensor.detach().isfinite()
+        if not finite.all():
+            place = tuple((~finite).nonzero()[0].tolist())
+            raise ValueError(f"{name} must be finite, got {tensor[place].item()} at {place}")
 
 
 def check_number(name: str, value, at_least: float = -math.inf, above: float = -math.inf) -> None:
@@ -104,6 +114,12 @@ def check_value(name: str, fits: bool, expected: str, got: Any) -> None:
     """Raises ValueError, naming an option, unless its value fits."""
     if not fits:
         raise ValueError(f"{name} must be {expected}, got {got}")
+
+
+def did_you_mean(names: Iterable[str], between: str = " or ") -> str:
+    """How an error goes on that knows what may have been meant; "" where it knows nothing."""
+    near = between.join(names)
+    return f"; did you mean {near}?" if near else ""
 
 
 def _is_finite(value: Real) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from . import _C  # loads the ops
+from .checks import did_you_mean
 from .render.autocast import widened
 
 _VARIANTS: dict[str, list[dict[str, Any]]] = {}  # what the headers say, by public name, in the order of the registry
@@ -150,8 +151,7 @@ def _meant(name: str) -> str:
     first = re.match(r"\w*", name)[0]
     if first != name and first in FOOTPRINTS:
         return f"; options follow a colon, as in {RECOMMENDED}"
-    near = difflib.get_close_matches(name.lower(), FOOTPRINTS, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
+    return did_you_mean(difflib.get_close_matches(name.lower(), FOOTPRINTS, n=1))
 
 
 def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from .. import _C
-from ..checks import check_tensors, one_number, whole_number
+from ..checks import check_finite, check_tensors, one_number, whole_number
 from ..ops import Op
 from ..render.autocast import widened
 from ..render.effects import AUTO, NEAR, Effects
@@ -67,10 +67,7 @@ def camera_settings(
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
     if world_to_camera.device.type == "cpu" and not torch.compiler.is_compiling():
-        broken = world_to_camera.detach().isfinite().logical_not().nonzero()
-        if len(broken):
-            place = tuple(broken[0].tolist())
-            raise ValueError(f"world_to_camera must be finite, got {world_to_camera[place].item()} at {place}")
+        check_finite(world_to_camera=world_to_camera)
     _check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
     if lens is not None:
         effects = _with_lens(effects, lens)

@@ -10,7 +10,7 @@ import re
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from io import StringIO
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import torch
 
 from .. import _C
 from ..captures.loading import CHOICES, IMAGES, TEST_PERIOD
+from ..checks import did_you_mean
 from ..filters import PIXEL_VARIANCE
 from ..io.errors import SceneError, SceneWarning
 from ..io.images import BACKGROUNDS
@@ -68,7 +69,7 @@ class Parser(argparse.ArgumentParser):
         unknown = self._unknown_options(args)
         if unknown:  # before what argparse says of an option that is required, and here has another name
             near = dict.fromkeys(name for option in unknown for name in self._near_options(option))
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{_did_you_mean(near)}")
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(near)}")
         parsed, rest = super().parse_known_args(args, namespace)
         if not hasattr(parsed, KNOWN_OPTIONS):  # a command's, which has its own parser, are there already
             setattr(parsed, KNOWN_OPTIONS, frozenset(self._option_string_actions))
@@ -99,7 +100,7 @@ class Parser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
-            error.message += _did_you_mean(difflib.get_close_matches(str(value), map(str, action.choices), 1))
+            error.message += did_you_mean(difflib.get_close_matches(str(value), map(str, action.choices), 1))
             raise
 
     def error(self, message):
@@ -108,12 +109,6 @@ class Parser(argparse.ArgumentParser):
             message += "; lists have commas and no spaces: 1,2,4"
         report(f"{message} (see {self.prog} --help)")
         self.exit(2)
-
-
-def _did_you_mean(names: Iterable[str]) -> str:
-    """How an error goes on that knows what may have been meant."""
-    near = " or ".join(names)
-    return f"; did you mean {near}?" if near else ""
 
 
 def _with_joined_colors(args: list[str]) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from ..checks import check_finite
 from .autocast import widened
 from .effects import Effects, GaussianStats
 
@@ -56,9 +57,8 @@ def split_background(
     channels = 3 if colors_precomp is None else colors_precomp.shape[-1]
     if bg.shape != (channels, *size):
         raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
-    if (bg.device.type == "cpu" or debug) and not torch.compiler.is_compiling() and not bg.isfinite().all():
-        place = tuple((~bg.isfinite()).nonzero()[0].tolist())
-        raise ValueError(f"bg must be finite, got {bg[place].item()} at {place}")
+    if (bg.device.type == "cpu" or debug) and not torch.compiler.is_compiling():
+        check_finite(bg=bg)
     return bg.new_zeros(channels), bg
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..checks import did_you_mean
 from ..footprints import Footprint, chosen_footprint, get_default_footprint, resolve_footprint
 from .effects import AUTO, Effects
 
@@ -93,8 +94,8 @@ class GaussianRasterizationSettings(_Fields):
             known = (*self._fields, "footprint", "effects")
             names = (*self._names_of_fields(), *known)
             near = [name for given in options if given not in names for name in get_close_matches(given, names, 1)]
-            hint = f"; did you mean {', '.join(near)}?" if near else ""
-            raise TypeError(f"settings must be among: {', '.join(known)}; got {', '.join(options)}{hint}")
+            said = f"settings must be among: {', '.join(known)}; got {', '.join(options)}"
+            raise TypeError(said + did_you_mean(near, ", "))
         if effects is not None:
             if not isinstance(effects, Effects) and effects != AUTO:
                 raise TypeError(f'effects must be an Effects or "auto", got {effects!r}')

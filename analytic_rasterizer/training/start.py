@@ -77,9 +77,6 @@ def begin(
 
     It is no less than twice the Gaussians of the start: fewer learn worse, also of random ones.
     """
-    maps = [item.depth for item in capture.train if item.depth is not None]
-    if "depth_unit" in chosen and maps and all(file.is_inverse for file in maps):
-        raise ValueError("--depth-unit has no effect: all depth maps hold inverse depths, which have none")
     # Of the files: photographs are often smaller than their cameras say, as those of images_4 are.
     limit = pixel_limit(options, [header[:2] for _, header in read_sizes(capture.train)], chosen)
     start, found = first_gaussians(options, capture, points, chosen)
@@ -107,9 +104,11 @@ def first_gaussians(
         ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises; an
             option among those `given` that has no effect.
     """
+    maps = [item.depth for item in capture.train if item.depth is not None]
+    inverse_maps = bool(maps) and all(file.is_inverse for file in maps)
     offset = torch.tensor(capture.offset or (0.0, 0.0, 0.0), dtype=torch.float64, device="cpu")
     if points is not None and io.is_scene(points):
-        check_effect(options, given, "a scene")
+        check_effect(options, given, "a scene", inverse_maps)
         scene = io.load_scene(points)
         if not len(scene.means):  # from which nothing would ever grow
             raise io.SceneError(f"{points}: the scene has no Gaussians")
@@ -122,7 +121,7 @@ def first_gaussians(
         if not (scene.opacities >= FAINTEST).any():
             raise io.SceneError(f"{points}: all Gaussians are transparent (opacities below 1/255), none can learn")
         return scene.with_sh_degree(options.sh_degree).trainable(), None
-    check_effect(options, given, "nothing" if points is None and capture.points is None else "points")
+    check_effect(options, given, "nothing" if points is None and capture.points is None else "points", inverse_maps)
     found = capture.points
     if points is not None:
         positions, colors = io.load_points(points)

@@ -10,20 +10,21 @@ from .parts import steps_at
 from .schedule import SH_SHARE, changes_at
 
 
-def check_effect(options: TrainingOptions, given: Collection[str], start: str) -> None:
+def check_effect(options: TrainingOptions, given: Collection[str], start: str, inverse_maps: bool = False) -> None:
     """Raises ValueError for the first of the options `given` that has no effect, and says why.
 
     Args:
         start: What the training starts from: "a scene", "points", or "nothing".
+        inverse_maps: Whether the depth maps of the capture all hold inverse depths.
     """
-    reasons = without_effect(options, start)
+    reasons = without_effect(options, start, inverse_maps)
     for name in given:
         reason = of_other_control(name, options.density) or reasons.get(name)
         if reason is not None:
             raise ValueError(f"{flag(name)} has no effect: {reason}")
 
 
-def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str, str]:
+def without_effect(options: TrainingOptions, start: str = "nothing", inverse_maps: bool = False) -> dict[str, str]:
     """The names of all options that have no effect beside the others, with the reason.
 
     Of a training by the clock nobody knows the steps, so that they are no reason.
@@ -52,6 +53,8 @@ def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str
         note(["depth_weight", "depth_weight_end"], "depth is none")
     if options.depth != "maps":
         note(["depth_fit", "depth_unit"], f"it is for depth maps, and depth is {options.depth}")
+    if inverse_maps:
+        note(["depth_unit"], "all depth maps hold inverse depths, which have none")
     if options.sh_degree == 0:
         note(["sh_every"], "sh_degree is 0")
     if options.rates_half_life == 0:

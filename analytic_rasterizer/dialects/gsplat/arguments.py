@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from ..._C import MAX_CHANNELS
-from ...checks import one_number, whole_number
+from ...checks import check_finite, one_number, whole_number
 from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, resolve_footprint
 from ...render.autocast import way_out_of
 from ...render.effects import MAX_SH_DEGREE
@@ -228,11 +228,7 @@ def check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any
 
 def check_finite_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
     """Raises ValueError with the place of the first number that is not finite, of those that are read."""
-    for name, tensor in (("viewmats", viewmats[..., :3, :]), ("Ks", Ks[..., :2, :])):
-        bad = tensor.detach().isfinite().logical_not().nonzero()
-        if len(bad):
-            place = tuple(bad[0].tolist())
-            raise ValueError(f"{name} must be finite, got {tensor[place].item()} at {place}")
+    check_finite(viewmats=viewmats[..., :3, :], Ks=Ks[..., :2, :])
 
 
 @dataclass(frozen=True)
